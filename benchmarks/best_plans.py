@@ -23,7 +23,7 @@ from cirl_marl.controllers.rollout import episode_start
 from cirl_marl.controllers.schedule import Schedule, schedule
 from cirl_marl.definitions.writer import fingerprint
 from cirl_marl.network import Floats
-from cirl_marl.optimum import NoCertificate, Plan, bound, improved, search
+from cirl_marl.optimum import NoCertificate, Plan, bound, improve_plan, search
 from cirl_marl.optimum.planned_episodes import starting_states
 from cirl_marl.records.files import write_atomically
 from cirl_marl.records.machine import versions
@@ -140,7 +140,7 @@ def best_plan(name: str) -> BestPlan:
             except CirlError:
                 if level == DEMANDED[-1]:
                     raise
-        proved, plan = float(found.objective), improved(found).actions
+        proved, plan = float(found.objective), improve_plan(found).actions
     except NoCertificate as missing:
         reason, level = str(missing), SEARCHED
         iterations = ITERATIONS.get(name, USUAL_ITERATIONS)

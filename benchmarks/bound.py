@@ -21,9 +21,20 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from benchmarks.document import made_with, write_sections
 from cirl_marl import MultiAgentVectorEnv
 from cirl_marl.controllers.rollout import EVALUATION_SEEDS, rollout
-from cirl_marl.errors import CirlError, unknown
+from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.evaluation.comparison import starting_stocks
-from cirl_marl.optimum import Bound, Envelope, Incumbent, Plan, achieved, bound, envelope, gap, improved, search
+from cirl_marl.optimum import (
+    Bound,
+    Envelope,
+    Incumbent,
+    Plan,
+    bound,
+    envelope,
+    gap,
+    improve_plan,
+    search,
+    simulate_plan,
+)
 from cirl_marl.optimum.mpc import MPC
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "plans.md"
@@ -63,7 +74,7 @@ def main(
     known = _sections()
     for name in only or known:
         if name not in known:
-            raise CirlError(unknown("section", name, known))
+            raise CirlError(unknown_name("section", name, known))
     chosen = {name: section for name, section in known.items() if name in (only or known)}
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     written = {}
@@ -88,7 +99,7 @@ def _sections() -> dict[str, Section]:
             {name: partial(_starts, name) for name in NETWORKS},
         ),
         "plans": Section(
-            ("network", "degree", "bound on λ̄", "CPU s", "`plan`: λ̄, service", "`improved`: λ̄, service", "gap"),
+            ("network", "degree", "bound on λ̄", "CPU s", "`plan`: λ̄, service", "`improve_plan`: λ̄, service", "gap"),
             {f"{name}, degree {d}": partial(_plan, name, d) for name in NETWORKS for d in (1, 2, 3)},
         ),
         "price": Section(
@@ -106,7 +117,7 @@ def _sections() -> dict[str, Section]:
             (
                 "network",
                 "bound on λ̄",
-                "`improved`: λ̄, service",
+                "`improve_plan`: λ̄, service",
                 "population × iterations",
                 "search: λ̄, service",
                 "gap",
@@ -160,8 +171,8 @@ def _plan(name: str, degree: int) -> Rows:
     began = time.process_time()
     found = bound(name, min_service=SERVICE, degree=degree)
     seconds = time.process_time() - began
-    better = improved(found)
-    left = found.gap(achieved(better).episode_circularity)[0]
+    better = improve_plan(found)
+    left = found.gap(simulate_plan(better).episode_circularity)[0]
     shown = f"{found.objective:.6g} {found.network.mass_unit}"
     yield _row((name, degree, shown, f"{seconds:.0f}", _achieved(found), _achieved(better), _percent(left)))
 
@@ -190,7 +201,7 @@ def _search(name: str) -> Rows:
     """Hold the search from the first evaluated episode against the bound of degree 2 from there."""
     start = starting_stocks(MultiAgentVectorEnv(name, num_envs=1), EVALUATION_SEEDS)[0]
     proved = bound(name, start, min_service=SERVICE, degree=2)
-    shown = [f"{proved.objective:.5g} {proved.network.mass_unit}", _achieved(improved(proved))]
+    shown = [f"{proved.objective:.5g} {proved.network.mass_unit}", _achieved(improve_plan(proved))]
     for population, iterations in ((64, 30), (64, 150), (256, 300)):
         began = time.process_time()
         found = search(name, min_service=SERVICE, population=population, iterations=iterations)
@@ -253,7 +264,7 @@ def _mpc(name: str, horizon: int | None) -> Rows:
 
 
 def _achieved(plan: Bound) -> str:
-    run = achieved(plan)
+    run = simulate_plan(plan)
     return _figures(float(run.episode_circularity[0]), float(run.episode_service[0]))
 
 

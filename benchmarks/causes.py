@@ -22,7 +22,7 @@ import typer
 from rich.console import Console
 
 from benchmarks.document import markdown_table, write_sections
-from cirl_marl.errors import CirlError, unknown
+from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.evaluation import Entry, compare
 from cirl_marl.learners import Recipe, RunDirectory, load_recipe, train_seeds
 from cirl_marl.records.files import write_json
@@ -128,7 +128,7 @@ def main(
     """Train what is missing and write the table."""
     for name in only or ():
         if name not in VARIANTS:
-            raise CirlError(unknown("variant", name, VARIANTS))
+            raise CirlError(unknown_name("variant", name, VARIANTS))
     names = only or list(VARIANTS)
     missing = [name for name in names if not table and not _is_done(out, name)]
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:

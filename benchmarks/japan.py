@@ -21,7 +21,7 @@ from cirl_marl.evaluation import Comparison, compare
 from cirl_marl.evaluation.sampling import sample_episodes, sensitivities
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
-from cirl_marl.optimum import Bound, achieved, bound, gap, improved
+from cirl_marl.optimum import Bound, bound, gap, improve_plan, simulate_plan
 from cirl_marl.report.decisions import savings
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "japan.md"
@@ -53,7 +53,7 @@ class Levers:
         actions = self._usual.copy()
         entries = [self._entries[agent] for lever in levers for agent in self.agents[lever]]
         actions[:, entries] = self.plan.actions[:, entries]
-        return achieved(replace(self.plan, actions=actions))
+        return simulate_plan(replace(self.plan, actions=actions))
 
 
 def question(plan: Bound) -> Iterator[str]:
@@ -164,7 +164,7 @@ def main() -> None:
     parser.add_argument("--run", type=Path, help="agents trained by cirl train steel_japan")
     asked = parser.parse_args()
     network = load_network(NAME)
-    plan = improved(bound(network, min_service=1.0))
+    plan = improve_plan(bound(network, min_service=1.0))
     parts = {
         "saved": question(plan),
         "levers": order(plan),

@@ -27,7 +27,7 @@ from cirl_marl.controllers.rollout import episode_start, rollout
 from cirl_marl.importing.definition import identifiers, shares_of
 from cirl_marl.importing.flow_table import read_flows
 from cirl_marl.network import Floats, Network
-from cirl_marl.optimum import achieved, bound, improved
+from cirl_marl.optimum import bound, improve_plan, simulate_plan
 from cirl_marl.optimum.planned_episodes import HasPlan, Plan
 from cirl_marl.records.files import write_table
 
@@ -212,8 +212,8 @@ def planned() -> tuple[HasPlan, Iterator[str]]:
     found = bound(load_network(ENVS / "steel_world.toml"), min_service=1.0, degree=DEGREE)
     proved = found.verify().bound
     solved = time.process_time()
-    plan = improved(found)
-    run = achieved(plan)
+    plan = improve_plan(found)
+    run = simulate_plan(plan)
     done = time.process_time()
     reached, levels = float(run.episode_circularity[0]), run.episode_levels[0]
     there = float(found.at(min_service=np.minimum(levels, 1.0)))

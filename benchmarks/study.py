@@ -25,7 +25,7 @@ from cirl_marl.controllers import LQR, Controller, Neutral
 from cirl_marl.controllers.rollout import first_seed, rollout
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, RunError, unknown
+from cirl_marl.errors import CirlError, RunError, unknown_name
 from cirl_marl.evaluation import Comparison, Row, compare, solve_baseline
 from cirl_marl.evaluation.comparison import starting_stocks
 from cirl_marl.evaluation.statistics import Aggregate, over_episodes, over_seeds
@@ -161,7 +161,7 @@ def main(
     chosen = recipes or list(RECIPES)
     for name, known in (*((n, CASES) for n in names), *((r, RECIPES) for r in chosen)):
         if name not in known:
-            raise CirlError(unknown("part of the study", name, known))
+            raise CirlError(unknown_name("part of the study", name, known))
     planned = [job for name in names for job in _jobs(out, name, chosen, seeds, steps)]
     if not table:
         _train(planned, out / "jobs", jobs)

@@ -37,7 +37,7 @@ from cirl_marl import (
     Service,
 )
 from cirl_marl.controllers.rollout import Rollout
-from cirl_marl.optimum import achieved, bound, improved
+from cirl_marl.optimum import bound, improve_plan, simulate_plan
 
 WEEK = 1 / 52
 DURABLE = 4.0
@@ -114,8 +114,8 @@ def planned(seed: int) -> Outcome:
             break
         proved = min(proved, found.objective)
         reached: list[float] = []
-        plan = improved(found if plan is None else plan, rounds=ROUNDS, enough=enough)
-        enough(achieved(plan))
+        plan = improve_plan(found if plan is None else plan, rounds=ROUNDS, enough=enough)
+        enough(simulate_plan(plan))
         if best >= proved - GAP * abs(proved):
             break
     gap = (proved - best) / abs(proved) if np.isfinite(best) else np.nan

@@ -86,10 +86,10 @@ if TYPE_CHECKING:
     from cirl_marl.optimum.bounds import envelope as envelope
     from cirl_marl.optimum.bounds import gap as gap
     from cirl_marl.optimum.cross_entropy import search as search
-    from cirl_marl.optimum.improve import improved as improved
+    from cirl_marl.optimum.improve import improve_plan as improve_plan
     from cirl_marl.optimum.mpc import MPC as MPC
     from cirl_marl.optimum.planned_episodes import Plan as Plan
-    from cirl_marl.optimum.planned_episodes import achieved as achieved
+    from cirl_marl.optimum.planned_episodes import simulate_plan as simulate_plan
     from cirl_marl.reasons.explanation import explain as explain
     from cirl_marl.reasons.inverse import infer as infer
     from cirl_marl.report.results import draw as draw
@@ -133,9 +133,9 @@ _MODULES = {
     "optimum.admissible": "NoCertificate",
     "optimum.bounds": "Bound bound envelope gap",
     "optimum.cross_entropy": "search",
-    "optimum.improve": "improved",
+    "optimum.improve": "improve_plan",
     "optimum.mpc": "MPC",
-    "optimum.planned_episodes": "Plan achieved",
+    "optimum.planned_episodes": "Plan simulate_plan",
     "reasons.explanation": "explain",
     "reasons.inverse": "infer",
     "report.results": "draw summarise write_report",

@@ -44,17 +44,17 @@ class LearnerError(RuntimeError):
     """A learner failed while training; names its agent and the joint step."""
 
 
-def unknown(kind: str, name: object, known: Iterable[object]) -> str:
+def unknown_name(kind: str, name: object, known_names: Iterable[object]) -> str:
     """Say that ``name`` is no ``kind``, with the nearest match, whatever the case of its letters, and all options.
 
-    >>> unknown("law", "donnor", ["donor", "recipient"])
+    >>> unknown_name("law", "donnor", ["donor", "recipient"])
     "unknown law 'donnor'. Did you mean 'donor'? Known: donor, recipient."
-    >>> unknown("algorithm", "ppo", ["A2C", "PPO"])
+    >>> unknown_name("algorithm", "ppo", ["A2C", "PPO"])
     "unknown algorithm 'ppo'. Did you mean 'PPO'? Known: A2C, PPO."
     """
-    options = [str(option) for option in known]
-    written = {option.lower(): option for option in options}
-    match = difflib.get_close_matches(str(name).lower(), written, n=1, cutoff=0.5)
-    hint = f" Did you mean '{written[match[0]]}'?" if match else ""
-    shown = ", ".join(options[:30]) + (f", … ({len(options)} in all)" if len(options) > 30 else "")
-    return f"unknown {kind} '{name}'.{hint} Known: {shown or 'none'}."
+    options = [str(option) for option in known_names]
+    by_lower_case = {option.lower(): option for option in options}
+    match = difflib.get_close_matches(str(name).lower(), by_lower_case, n=1, cutoff=0.5)
+    hint = f" Did you mean '{by_lower_case[match[0]]}'?" if match else ""
+    listed_names = ", ".join(options[:30]) + (f", … ({len(options)} in all)" if len(options) > 30 else "")
+    return f"unknown {kind} '{name}'.{hint} Known: {listed_names or 'none'}."

@@ -5,13 +5,13 @@ Ten days of the copper network; whole episodes take a minute.
 
 from rich import print
 
-from cirl_marl import MPC, achieved, bound, envelope, gap, improved, rollout, vector_env
+from cirl_marl import MPC, bound, envelope, gap, improve_plan, rollout, simulate_plan, vector_env
 
 service, horizon = 0.98, 40
 
 best = bound("copper_net", min_service=service, horizon=horizon)
 proof = best.verify()  # from the multipliers alone, without the solver
-plan = achieved(improved(best))  # in the simulator
+plan = simulate_plan(improve_plan(best))  # in the simulator
 
 env = vector_env("copper_net", num_envs=2, horizon=horizon)
 env.reset(seed=0)

@@ -67,7 +67,7 @@ def named(*places: str) -> Any:
 
 app = named("cirl_marl.cli:app")
 bound = named("cirl_marl:bound", "cirl_marl.optimum:bound")
-improved = named("cirl_marl.optimum:improved")
+improve_plan = named("cirl_marl.optimum:improve_plan", "cirl_marl.optimum:improved")
 search = named("cirl_marl.optimum:search")
 train = named("cirl_marl:train", "cirl_marl.learners:train")
 
@@ -182,7 +182,7 @@ def bounded() -> Iterator[tuple[str, str]]:
         settings: tuple[dict[str, Any], ...] = ({}, {"min_service": 0.97}, {"service_weight": 3.0})
         for options in settings:
             proven = bound(name, horizon=6, **options)
-            better = improved(proven, rounds=2)
+            better = improve_plan(proven, rounds=2)
             proof = [proven.certificate.equal, proven.certificate.under, proven.verify().bound]
             yield f"bound {name} {options}", digest(proven.objective, proof, proven.actions, better.actions)
     for name in ("solids_net", "net_zero"):

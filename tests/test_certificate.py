@@ -9,7 +9,7 @@ import pytest
 from scipy import sparse
 
 from cirl_marl import CirlError, Network, load_network
-from cirl_marl.optimum import Certificate, achieved, bound
+from cirl_marl.optimum import Certificate, bound, simulate_plan
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.certificate import verify
 from cirl_marl.optimum.options import starting_stocks
@@ -30,7 +30,7 @@ def test_multipliers_of_an_over_constrained_program_prove_nothing_false(name: st
     multipliers = _over_constrained(problem)
     wrong = float(multipliers.under.max())
     best = bound(network, degree=1)
-    reached = float(achieved(best).episode_circularity[0])
+    reached = float(simulate_plan(best).episode_circularity[0])
     scale = abs(reached)
     trusting = _if_signs_were_trusted(problem, multipliers)
     assert wrong > 0 and trusting < reached - 0.1 * scale, "the multipliers are no temptation"

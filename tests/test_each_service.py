@@ -30,7 +30,7 @@ from cirl_marl.controllers.rollout import rollout
 from cirl_marl.definitions.reader import write_network
 from cirl_marl.evaluation import compare, solve_baseline
 from cirl_marl.evaluation.pareto import pareto_front
-from cirl_marl.optimum import Plan, achieved, bound, envelope, improved, search
+from cirl_marl.optimum import Plan, bound, envelope, improve_plan, search, simulate_plan
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.bounds import highest_service
 from cirl_marl.optimum.mpc import MPC, Optimum
@@ -71,7 +71,7 @@ def test_each_service_is_held(demanded: Levels) -> None:
     found = bound(town(), min_service=demanded)
     assert (found.levels >= np.array(demanded) - 1e-6).all()
     played = {
-        "improved": achieved(improved(found)),
+        "improved": simulate_plan(improve_plan(found)),
         "optimum": rollout(MultiAgentVectorEnv(town(), num_envs=1), Optimum(min_service=demanded)),
         "mpc": rollout(MultiAgentVectorEnv(town(), num_envs=1), MPC(min_service=demanded)),
         "window": rollout(MultiAgentVectorEnv(town(), num_envs=1), MPC(min_service=demanded, horizon=4)),
@@ -90,9 +90,9 @@ def test_improvement_finds_what_every_service_lacks() -> None:
     """From a plan that builds nothing, first steps that reach neither demand go towards both."""
     found = bound(town(), min_service=[0.7, 0.9])
     idle = replace(found, actions=np.full_like(found.actions, -1.0))
-    first = achieved(improved(idle, rounds=1)).episode_levels[0] - achieved(idle).episode_levels[0]
+    first = simulate_plan(improve_plan(idle, rounds=1)).episode_levels[0] - simulate_plan(idle).episode_levels[0]
     assert (first > 0.02).all()
-    run = achieved(improved(idle))
+    run = simulate_plan(improve_plan(idle))
     assert (run.episode_levels[0] >= np.array([0.7, 0.9]) - 1e-4).all()
     assert 0 <= found.gap(run.episode_circularity)[0] < 0.01
 
@@ -217,7 +217,7 @@ def test_networks_without_services() -> None:
     still = replace(town(), services=())
     for options in ({}, {"min_service": 0.9}, {"service_weight": 2.0}):
         found = bound(still, **options)  # type: ignore[arg-type]
-        run = achieved(improved(found, rounds=2))
+        run = simulate_plan(improve_plan(found, rounds=2))
         assert (found.service, found.levels.shape, run.episode_levels.shape) == (1.0, (0,), (1, 0))
         assert run.least_service == run.episode_service == 1.0
     env = MultiAgentVectorEnv(still, num_envs=2, horizon=2)

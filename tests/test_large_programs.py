@@ -9,7 +9,7 @@ import pytest
 from scipy import sparse
 
 from cirl_marl import load_network
-from cirl_marl.optimum import achieved, bound, improve, improved, program, reach, solver
+from cirl_marl.optimum import bound, improve, improve_plan, program, reach, simulate_plan, solver
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.improve import penalised_objective, prices
 
@@ -32,7 +32,7 @@ def test_coarse_pieces_bound_what_the_simulator_does(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(program, "LARGE", 0)
     found = bound("steel_japan", min_service=1.0, degree=1, horizon=6)
     assert found.problem.layout.coarse and not found.problem.layout.has_end_flows
-    run = achieved(found)
+    run = simulate_plan(found)
     assert run.episode_levels.min() > 0.999
     assert 0 < found.gap(run.episode_circularity[0]) < 0.02
 
@@ -85,8 +85,8 @@ def test_plans_of_large_networks_make_up_for_what_lacked(monkeypatch: pytest.Mon
     found = bound("copper_net", min_service=1.0, degree=1, horizon=40)
     monkeypatch.setattr(improve, "MOST_SLOPES", 0)
     monkeypatch.setattr(improve, "_jacobians", None)
-    better = improved(found)
-    before, after = achieved(found), achieved(better)
+    better = improve_plan(found)
+    before, after = simulate_plan(found), simulate_plan(better)
     assert better.objective == found.objective
     lacking = [1.0 - float(run.episode_levels.min()) for run in (before, after)]
     assert lacking[0] > 5e-4 and lacking[1] < 1e-4

@@ -17,7 +17,7 @@ from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.network.elements import Lifetime
 from cirl_marl.network.lifetimes import chain_of
-from cirl_marl.optimum import achieved, bound, envelope, improved
+from cirl_marl.optimum import bound, envelope, improve_plan, simulate_plan
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.kernels import Kernel
 from cirl_marl.optimum.mpc import MPC
@@ -107,7 +107,7 @@ def test_what_leaves_at_once_is_allowed(mean: float, deviation: float, degree: i
     inflow = np.array([0.01, 0.01, 100.0, 0.01, 0.01, 50.0, 1.0])
     network = town(lifetime, inflow, initial=0.0)
     found = bound(network, degree=degree)
-    assert float(achieved(found).episode_circularity[0]) <= found.objective * (1 - 1e-9)
+    assert float(simulate_plan(found).episode_circularity[0]) <= found.objective * (1 - 1e-9)
     run = rollout(MultiAgentVectorEnv(network, num_envs=1), Neutral())
     low = float(run.flow[:, network.arc_index["discard"]].max())
     served = replace(network, services=(Service(id="old", provider="discard", quantity="flow", low=low),))
@@ -119,7 +119,7 @@ def test_a_delay_is_exact() -> None:
     """What comes out of a fixed lifetime is known, or entered before: nothing is left open."""
     network = town(LIVES[1], INFLOW[:20], initial=60.0, growth=0.03)
     found = bound(network)
-    run = achieved(found)
+    run = simulate_plan(found)
     assert found.objective == pytest.approx(run.episode_circularity[0], rel=1e-9)
     np.testing.assert_allclose(found.stock[1:], run.stock, rtol=1e-6, atol=1e-6)
 
@@ -130,7 +130,7 @@ def test_a_cycle_of_four_products_is_planned() -> None:
     network = product_cycle(6)
     found = bound(network, min_service=0.9)
     assert found.verify().bound == found.objective
-    run = achieved(improved(found))
+    run = simulate_plan(improve_plan(found))
     assert run.episode_levels[0].min() >= 0.9 - 1e-4
     assert 0.0 <= found.gap(run.episode_circularity)[0] < 0.01
     starts = network.initial[1] * np.array([[0.97], [1.0]])
@@ -147,7 +147,7 @@ def test_prolonged_lifetimes_are_planned_below_the_bound() -> None:
     """By stages; agents who prolong lives do better than those who cannot."""
     network = product_cycle(6, controlled=True)
     found, without = bound(network, min_service=0.9), bound(product_cycle(6), min_service=0.9)
-    run = achieved(improved(found))
+    run = simulate_plan(improve_plan(found))
     assert run.episode_levels[0].min() >= 0.9 - 1e-4
     assert without.objective < float(run.episode_circularity[0]) <= found.objective
     assert found.gap(run.episode_circularity)[0] < 0.1

@@ -35,7 +35,17 @@ from cirl_marl.controllers.rollout import rollout
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.network.elements import FIXED_LIFETIME
 from cirl_marl.network.series import Series
-from cirl_marl.optimum import Bound, Certificate, NoCertificate, Plan, achieved, bound, envelope, improved, reach
+from cirl_marl.optimum import (
+    Bound,
+    Certificate,
+    NoCertificate,
+    Plan,
+    bound,
+    envelope,
+    improve_plan,
+    reach,
+    simulate_plan,
+)
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.certificate import verify
 from cirl_marl.optimum.options import starting_stocks
@@ -138,7 +148,7 @@ def test_no_episode_exceeds_the_bound(network: Network, interval: float, seed: i
     mass = found.initial.sum() * network.objective.reference_interval  # the simulator rounds relative to all the mass
     slack = 1e-9 * (abs(found.objective) + np.abs(objective).max()) + 1e-12 * mass
     assert objective.max() <= found.objective + slack
-    run = achieved(found)
+    run = simulate_plan(found)
     assert found.gap(run.episode_circularity, run.episode_service).min() * abs(found.objective) >= -slack or (
         found.objective == 0 and run.episode_circularity.max() <= slack
     )
@@ -230,7 +240,7 @@ def test_single_valve() -> None:
     found = bound(small([RESERVE, USE], [arc]), degree=4)
     expected = -100 * (1 - math.exp(-0.4 * 0.5 * 4)) / 4
     assert found.objective == pytest.approx(expected, rel=1e-7)
-    assert achieved(found).episode_circularity[0] == pytest.approx(expected, rel=1e-7)
+    assert simulate_plan(found).episode_circularity[0] == pytest.approx(expected, rel=1e-7)
     np.testing.assert_allclose(found.actions, -1.0, atol=1e-6)
 
 
@@ -247,7 +257,7 @@ def test_capture_is_limited_by_its_capacity() -> None:
     air = stocked("air", 1000.0, Role.ENVIRONMENT)
     found = bound(small([air, USE], [order("capture", "air", "use", 7.0)]))
     assert found.objective == pytest.approx(7.0, rel=1e-9)
-    assert achieved(found).episode_circularity[0] == pytest.approx(7.0, rel=1e-9)
+    assert simulate_plan(found).episode_circularity[0] == pytest.approx(7.0, rel=1e-9)
 
 
 def test_capture_is_limited_by_what_there_is() -> None:
@@ -264,7 +274,7 @@ def test_service_costs_its_throughput() -> None:
     network = small([RESERVE, USE, TIP], arcs, [service])
     found = bound(network, min_service=1.0, degree=4)
     assert found.objective == pytest.approx(-6.0, rel=1e-5)
-    run = achieved(found)
+    run = simulate_plan(found)
     assert run.episode_circularity[0] == pytest.approx(-6.0, rel=1e-5)
     assert run.episode_service[0] == pytest.approx(1.0, abs=1e-6)
     # one unit of weight on service is worth less than what service costs, a hundred is worth more
@@ -280,7 +290,7 @@ def test_net_zero_by_absolute_value() -> None:
     assert bound(network).objective == pytest.approx(4.0, rel=1e-9)
     absolute = bound(network.with_options(objective={"net_zero": "abs"}))
     assert absolute.objective == pytest.approx(0.0, abs=1e-8)
-    assert achieved(absolute).episode_circularity[0] == pytest.approx(0.0, abs=1e-6)
+    assert simulate_plan(absolute).episode_circularity[0] == pytest.approx(0.0, abs=1e-6)
 
 
 def test_exogenous_series_is_exact() -> None:
@@ -435,8 +445,8 @@ def test_bad_envelopes(starts: list[float], solves: int, said: str) -> None:
 def test_plan_comes_close_to_the_bound(name: str) -> None:
     """Ten days of each network: the improved plan keeps the service and 99 % of the bound; neutral control does not."""
     found = bound(name, min_service=0.99, horizon=40)
-    better = improved(found, rounds=8)
-    run = achieved(better)
+    better = improve_plan(found, rounds=8)
+    run = simulate_plan(better)
     assert run.episode_service[0] > 0.99 - 1e-4
     assert 0 <= better.gap(run.episode_circularity)[0] < 0.01
     env = MultiAgentVectorEnv(pinned(found), num_envs=1)
@@ -446,7 +456,7 @@ def test_plan_comes_close_to_the_bound(name: str) -> None:
 def test_improvement_never_loses() -> None:
     """The weighted objective in the simulator does not fall, and stays below the bound."""
     found = bound("copper_net", service_weight=2.0, horizon=12)
-    before, after = (achieved(plan) for plan in (found, improved(found, rounds=4)))
+    before, after = (simulate_plan(plan) for plan in (found, improve_plan(found, rounds=4)))
     first, second = (found.gap(run.episode_circularity, run.episode_service)[0] for run in (before, after))
     assert 0 <= second <= first
 
@@ -458,7 +468,7 @@ def test_each_copy_follows_its_own_plan() -> None:
     starts = env.physical.stock[: len(env.network.nodes)].T
     bounds = [bound("carbo_net", start, horizon=6) for start in starts]
     together = rollout(env, Plan(bounds), seed=5).episode_circularity
-    alone = [achieved(each).episode_circularity[0] for each in bounds]
+    alone = [simulate_plan(each).episode_circularity[0] for each in bounds]
     np.testing.assert_allclose(together, alone, rtol=1e-12)
     assert all(each.gap(value)[()] > -1e-9 for each, value in zip(bounds, together, strict=True))
 

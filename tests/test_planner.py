@@ -18,7 +18,7 @@ from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.definitions.catalogue import folder
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network import Floats
-from cirl_marl.optimum import NoCertificate, Plan, achieved, bound, improved, program, search, solver
+from cirl_marl.optimum import NoCertificate, Plan, bound, improve_plan, program, search, simulate_plan, solver
 from cirl_marl.optimum.mpc import MPC
 from cirl_marl.optimum.planned_episodes import starting_states
 
@@ -73,7 +73,7 @@ def test_residence_times_of_a_fraction_of_a_step(residence: float) -> None:
     found = bound(yearly(residence), min_service=0.97)
     proof = found.verify()
     assert proof.bound - proof.objective <= 1e-5 * abs(proof.bound)
-    episode = achieved(improved(found, rounds=6))
+    episode = simulate_plan(improve_plan(found, rounds=6))
     assert episode.episode_service[0] >= 0.97 - 1e-4
     assert 0.0 <= float(found.gap(episode.episode_circularity)[0]) < 0.01
 
@@ -89,7 +89,7 @@ def test_the_unit_of_mass_does_not_matter(tmp_path: Path) -> None:
         path.write_text(text.replace('mass = "kt"', f'mass = "{unit}"'), encoding="utf-8")
         network = load_network(path)
         found = bound(network, min_service=0.98, horizon=10, degree=1)
-        planned = achieved(improved(found))
+        planned = simulate_plan(improve_plan(found))
         env = MultiAgentVectorEnv(network, num_envs=1, horizon=6)
         controlled = rollout(env, MPC(min_service=0.98), seed=3)
         masses = [found.objective, planned.episode_circularity[0], controlled.episode_circularity[0]]
@@ -199,7 +199,7 @@ def test_controllers_that_plan_set_shares() -> None:
     def objective(run: Rollout) -> float:
         return float((run.episode_circularity / network.objective.circularity_scale + run.episode_service)[0])
 
-    neutral, planned = objective(rollout(env, Neutral())), objective(achieved(improved(found, rounds=6)))
+    neutral, planned = objective(rollout(env, Neutral())), objective(simulate_plan(improve_plan(found, rounds=6)))
     controlled = objective(rollout(env, MPC(service_weight=1.0, replan=1)))
     searched = search(network, service_weight=1.0, population=16, iterations=4, knots=2)
     by_search = objective(rollout(env, Plan(searched)))
@@ -219,5 +219,5 @@ def test_multipliers_of_merged_pieces_bound_other_starts(monkeypatch: pytest.Mon
     proved, solved = float(found.at(poor)), bound(network, poor)
     assert proved >= solved.objective - 1e-6 * abs(solved.objective)
     assert solved.at(found.initial) >= found.objective - 1e-6 * abs(found.objective)
-    run = achieved(solved)
+    run = simulate_plan(solved)
     assert run.episode_circularity[0] <= solved.objective

@@ -19,7 +19,7 @@ from cirl_marl.definitions.catalogue import families
 from cirl_marl.importing.definition import identifiers
 from cirl_marl.importing.flow_table import read_flows
 from cirl_marl.network.elements import Role
-from cirl_marl.optimum import achieved, bound, gap, improved
+from cirl_marl.optimum import bound, gap, improve_plan, simulate_plan
 
 NETWORKS = families()["steel"]
 
@@ -194,6 +194,6 @@ def test_mistakes_are_named(old: str, new: str, said: str, tmp_path: Path) -> No
 def test_plans_come_to_the_bound(network: str) -> None:
     """Within 1 %, at full service."""
     found = bound(network, min_service=1.0)
-    run = achieved(improved(found))
+    run = simulate_plan(improve_plan(found))
     assert run.levels.mean(axis=2).min() > 1 - 1e-6
     assert 0 <= float(gap(found.objective, run.episode_circularity[0])) < 0.01

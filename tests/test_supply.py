@@ -34,7 +34,7 @@ from cirl_marl.controllers.shortages import service_shortages
 from cirl_marl.definitions.reader import write_network
 from cirl_marl.network import Network
 from cirl_marl.network.elements import Lifetime
-from cirl_marl.optimum import achieved, bound, improved
+from cirl_marl.optimum import bound, improve_plan, simulate_plan
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.constraints import idle_supplies
 from cirl_marl.optimum.matrices import ProgramRows
@@ -282,7 +282,7 @@ def test_bounds_allow_all_that_may_be_supplied() -> None:
     found = bound(network, min_service=0.999)
     assert str(found).endswith("smelting may supply any amount within bounds in it")
     assert "may supply" not in str(bound(cycle(), min_service=0.9, horizon=3))
-    run = achieved(improved(found))
+    run = simulate_plan(improve_plan(found))
     assert float(run.episode_circularity[0]) <= found.objective
     neutral = rollout(MultiAgentVectorEnv(network, num_envs=1), Neutral())
     assert float(run.episode_circularity[0]) > float(neutral.episode_circularity[0])

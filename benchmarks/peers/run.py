@@ -24,7 +24,7 @@ from benchmarks.peers.tables import OURS, figures, gap_table, speed_table, verdi
 from benchmarks.peers.watch import Record
 from cirl_marl import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, unknown
+from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.records.files import write_json
 from cirl_marl.records.machine import processor
 
@@ -56,7 +56,7 @@ def main(
     """Install, train what is missing, and write figures and tables."""
     for name in only or ():
         if name not in CONTENDERS:
-            raise CirlError(unknown("contender", name, CONTENDERS))
+            raise CirlError(unknown_name("contender", name, CONTENDERS))
     chosen = only or list(CONTENDERS)
     fast = [name for name in chosen if name not in RECIPES]
     if not table:

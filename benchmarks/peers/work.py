@@ -16,7 +16,7 @@ from benchmarks.peers.contenders import CONTENDERS
 from benchmarks.peers.problem import measured_scaling
 from benchmarks.peers.settings import SETTINGS
 from benchmarks.peers.watch import Watch
-from cirl_marl.errors import CirlError, unknown
+from cirl_marl.errors import CirlError, unknown_name
 
 
 def main(
@@ -30,7 +30,7 @@ def main(
 ) -> None:
     """Train, and write what happened."""
     if contender not in CONTENDERS:
-        raise CirlError(unknown("contender", contender, CONTENDERS))
+        raise CirlError(unknown_name("contender", contender, CONTENDERS))
     watch = Watch(contender, seconds, every)
     scaling = measured_scaling()
     home, train = CONTENDERS[contender].code

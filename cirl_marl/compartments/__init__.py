@@ -8,7 +8,7 @@ from functools import cache
 from inspect import isabstract
 from typing import Any
 
-from cirl_marl.errors import CirlError, unknown
+from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network.compartment_model import (
     CompartmentModel,
     ContinuousModel,
@@ -94,7 +94,7 @@ def model_class(kind: str) -> type[Any]:
     try:
         return _models_of(ROBOTS)[kind]
     except KeyError:
-        raise CirlError(unknown("compartment kind", kind, models())) from None
+        raise CirlError(unknown_name("compartment kind", kind, models())) from None
 
 
 def kind_of(model: CompartmentModel) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import ControlError, unknown
+from cirl_marl.errors import ControlError, unknown_name
 
 Arrays = Mapping[str, NDArray[np.floating]]
 
@@ -56,7 +56,7 @@ class Constant(Controller):
         """Take the actions of ``env``'s agents; an agent that does not act or a value out of bounds is refused."""
         for agent, value in self._constants.items():
             if agent not in env.agents:
-                raise ControlError(f"constant control: {unknown('agent', agent, env.agents)}")
+                raise ControlError(f"constant control: {unknown_name('agent', agent, env.agents)}")
             if not -1.0 <= value <= 1.0:
                 raise ControlError(f"constant control of '{agent}' is {value}; it must lie in [-1, 1]")
         self._env = env

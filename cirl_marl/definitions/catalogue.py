@@ -11,7 +11,7 @@ from pathlib import Path
 from cirl_marl.definitions.code_permission import code_allowed
 from cirl_marl.definitions.ids import NAMESPACE, network_and_scenario
 from cirl_marl.definitions.reader import Definition
-from cirl_marl.errors import CirlError, unknown
+from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network import Network
 
 IN_PACKAGE = Path(__file__).parent.parent / "_catalogue"
@@ -85,7 +85,7 @@ def recipe_path(name: str | Path) -> Path:
     if str(name).endswith(".toml"):
         return Path(name)
     if name not in recipes():
-        raise CirlError(f"{unknown('recipe', name, recipes())} A file of your own must end in .toml.")
+        raise CirlError(f"{unknown_name('recipe', name, recipes())} A file of your own must end in .toml.")
     return folder("agents") / f"{name}.toml"
 
 
@@ -96,7 +96,7 @@ def _in_catalogue(name: str) -> tuple[Path, str]:
             return path, regions_[name]
     names = networks()
     regions = [path_ for path_ in names if path_.startswith(f"{name}_")]
-    raise CirlError(f"{unknown('network', name, regions or names)} A file of your own must end in .toml.")
+    raise CirlError(f"{unknown_name('network', name, regions or names)} A file of your own must end in .toml.")
 
 
 def _regions(path: Path) -> dict[str, str]:

@@ -15,7 +15,7 @@ from cirl_marl.definitions.error_messages import parameter_mistakes
 from cirl_marl.definitions.quantities import AmountColumn, AmountSeries, QuantityTable, Range
 from cirl_marl.definitions.schema import Batches, ModelTable, NetworkTable
 from cirl_marl.definitions.series_tables import Clock, column_value, inline_series, product
-from cirl_marl.errors import CirlError, NetworkError, unknown
+from cirl_marl.errors import CirlError, NetworkError, unknown_name
 from cirl_marl.network import Network, elements
 from cirl_marl.network.declarations import Declaration, Numbers, Quantity, Subtable, declarations
 from cirl_marl.network.elements import LAW_FIELDS, Arc, Control, ControlKind, Law, Node
@@ -192,7 +192,9 @@ class Converter:
         for name in (*table.initial, *with_range):
             if name not in with_range or name not in table.initial:
                 without_range = [state for state in with_range if state not in table.initial]
-                faults = f"'{name}' is missing" if name in with_range else unknown("inner state", name, without_range)
+                faults = (
+                    f"'{name}' is missing" if name in with_range else unknown_name("inner state", name, without_range)
+                )
                 self.mistakes.append(f"{path}.initial: {faults}")
         ranges = [table.initial[name] for name in with_range if name in table.initial]
         scale = table.reward_scale

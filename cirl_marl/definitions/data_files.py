@@ -12,7 +12,7 @@ from datetime import date
 from pathlib import Path
 from typing import Any, TypeVar
 
-from cirl_marl.errors import CirlError, unknown
+from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network.calendar import YearOrDate
 
 T = TypeVar("T")
@@ -101,7 +101,7 @@ class DataFiles:
             if path.exists() or path.is_symlink():
                 raise CirlError(f"{subject}: is no file")
             beside = sorted(file.name for file in path.parent.glob(f"*{path.suffix or '.csv'}"))
-            raise CirlError(f"{subject}: is not there; {unknown(f'file in {path.parent}', path.name, beside)}")
+            raise CirlError(f"{subject}: is not there; {unknown_name(f'file in {path.parent}', path.name, beside)}")
         if path.stat().st_size > LARGEST:
             raise CirlError(f"{subject}: is larger than {LARGEST // 10**6} MB; leave out rows that no 'where' chooses")
         self._stamps[path] = path.stat().st_mtime_ns
@@ -136,7 +136,7 @@ class _Table:
             times = YEAR
         for key in (column, *conditions, *([] if times is None else [times])):
             if key not in self.place:
-                fault = f"file '{self.name}': {unknown('column', key, self.header)}"
+                fault = f"file '{self.name}': {unknown_name('column', key, self.header)}"
                 raise CirlError(fault + ("" if len(self.header) > 1 else " Separate columns with commas."))
         matches = self._matching_rows(conditions)
         lines = [self.rows[i][0] for i in matches]
@@ -168,7 +168,7 @@ class _Table:
         for key, value in conditions.items():
             options = dict.fromkeys(row[self.place[key]] for row in rows)
             if value not in options:
-                return f"no row matches 'where'{before}: {unknown(key, value, sorted(options))}"
+                return f"no row matches 'where'{before}: {unknown_name(key, value, sorted(options))}"
             rows = [row for row in rows if row[self.place[key]] == value]
             before += f"{' and' if before else ' with'} {key} = '{value}'"
         return "has no rows"

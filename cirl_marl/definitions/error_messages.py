@@ -12,7 +12,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from cirl_marl.definitions.quantities import FORMS, forms
-from cirl_marl.errors import unknown
+from cirl_marl.errors import unknown_name
 
 BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
 """Kinds of the parameters that a definition can give."""
@@ -58,10 +58,10 @@ def _mistake(item: Mapping[str, Any], model: type[BaseModel]) -> str:
     if item["type"] == "extra_forbidden":
         parent = _model_at(model, location[:-1])
         options = [f.alias or name for name, f in parent.model_fields.items()] if parent else []
-        return f"{path}: {unknown('key', location[-1], options)}"
+        return f"{path}: {unknown_name('key', location[-1], options)}"
     if item["type"] in ("enum", "literal_error"):
         options = choices(str(item["ctx"]["expected"]))
-        return f"{path}: {unknown('value', item['input'], options)}"
+        return f"{path}: {unknown_name('value', item['input'], options)}"
     if item["type"] == "missing":
         return f"{path}: missing"
     if item["type"] in ("model_type", "model_attributes_type"):
@@ -101,7 +101,7 @@ def parameter_mistakes(
     accepts = {name: spec for name, spec in inspect.signature(kind).parameters.items() if spec.kind in BY_NAME}
     for name in (*parameters, *form):
         if name not in accepts:
-            yield unknown("parameter", name, accepts)
+            yield unknown_name("parameter", name, accepts)
     for name, parameter in accepts.items():
         if parameter.default is parameter.empty and name not in {*parameters, *form}:
             yield f"{name}: missing" if name == "form" else f"parameters.{name}: missing"

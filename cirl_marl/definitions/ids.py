@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cirl_marl.errors import CirlError, unknown
+from cirl_marl.errors import CirlError, unknown_name
 
 if TYPE_CHECKING:
     from cirl_marl.network import Network
@@ -63,6 +63,6 @@ def network_and_scenario(id_: str) -> tuple[str, str | None]:
     if 0 <= version < name_and_version(successor)[1]:
         raise CirlError(f"environment '{id_}' is out of date, as its numbers have changed: use '{successor}'")
     if id_ != successor:
-        raise CirlError(unknown("environment", id_, ids().values()))
+        raise CirlError(unknown_name("environment", id_, ids().values()))
     network, _, scenario = name.partition(".")
     return network, scenario or None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from cirl_marl.errors import unknown
+from cirl_marl.errors import unknown_name
 
 COMMON_KEYS = ("name", "regions", "scenarios")
 """What is the same in every scenario."""
@@ -61,6 +61,6 @@ def path_mistakes(document: Mapping[str, Any], paths: Any, prefix: str) -> Itera
         for key in path.split("."):
             if not isinstance(table, Mapping) or key not in table:
                 options = list(table) if isinstance(table, Mapping) else []
-                yield f"{prefix}without: '{path}': {unknown('key', key, options)}"
+                yield f"{prefix}without: '{path}': {unknown_name('key', key, options)}"
                 break
             table = table[key]

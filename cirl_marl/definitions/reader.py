@@ -20,7 +20,7 @@ from cirl_marl.definitions.overrides import COMMON_KEYS, overlay, path_mistakes,
 from cirl_marl.definitions.quantities import FORMS
 from cirl_marl.definitions.region_copies import compose_copies, copied_file
 from cirl_marl.definitions.schema import NetworkTable
-from cirl_marl.errors import CirlError, DefinitionError, NetworkError, unknown
+from cirl_marl.errors import CirlError, DefinitionError, NetworkError, unknown_name
 from cirl_marl.network import Network
 from cirl_marl.records.files import write_atomically
 
@@ -74,7 +74,9 @@ class Definition:
         if region not in (self.regions or [""]):
             example = f"as in {self.path.name}:{next(iter(self.regions), 'japan')}"
             question = f"which region? Known: {', '.join(self.regions)}. Write it after a colon, {example}"
-            raise DefinitionError(str(self.path), [unknown("region", region, self.regions) if region else question])
+            raise DefinitionError(
+                str(self.path), [unknown_name("region", region, self.regions) if region else question]
+            )
         if (name, region) not in self._networks and name != DEFAULT and not self._changes(name):
             like = self.network(DEFAULT, region)
             self._networks[name, region] = replace(
@@ -213,7 +215,7 @@ def _strangers(document: Mapping[str, Any], override: Mapping[str, Any], prefix:
             continue
         for name in changes:
             if name not in names:
-                yield f"{prefix}{table}: {unknown(table[:-1], name, names)}"
+                yield f"{prefix}{table}: {unknown_name(table[:-1], name, names)}"
     for key in COMMON_KEYS:
         if key in override:
             yield f"{prefix}{key}: a scenario cannot set it"

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from cirl_marl.definitions.error_messages import validation_mistakes
 from cirl_marl.definitions.overrides import overlay, path_mistakes, without_paths
 from cirl_marl.definitions.schema import CopiesTable
-from cirl_marl.errors import NetworkError, unknown
+from cirl_marl.errors import NetworkError, unknown_name
 from cirl_marl.network.declarations import Kinds, Quantity, declarations
 from cirl_marl.network.elements import Arc, Node
 
@@ -54,7 +54,7 @@ def compose_copies(
     pattern = _pattern(document, original, scenario)
     document_ = {k: dict(v) if isinstance(v, Mapping) else v for k, v in document.items() if k != "scenarios"}
     mistakes = [
-        f"copies.regions: {unknown('region', region_id, texts)}"
+        f"copies.regions: {unknown_name('region', region_id, texts)}"
         for region_id in table.regions
         if region_id not in texts
     ]
@@ -122,7 +122,7 @@ def _strangers(pattern: Document, change: Document, prefix: str) -> Iterator[str
     for part in NAME_KEYS:
         for id_ in change.get(part, {}):
             if id_ not in pattern.get(part, {}):
-                yield f"{prefix}{part}: {unknown(part[:-1], id_, pattern.get(part, {}))}"
+                yield f"{prefix}{part}: {unknown_name(part[:-1], id_, pattern.get(part, {}))}"
 
 
 def _copy(pattern: Document, region: str, text: str) -> dict[str, Any]:

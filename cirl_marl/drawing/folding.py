@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cirl_marl.drawing.style import readable
-from cirl_marl.errors import CirlError, unknown
+from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import Arc, Law, Node, Role
 
@@ -44,7 +44,7 @@ def fold_copies(
     """
     for region in open_copies:
         if region not in network.copies:
-            raise CirlError(f"network '{network.name}': {unknown('copy to unfold', region, network.copies)}")
+            raise CirlError(f"network '{network.name}': {unknown_name('copy to unfold', region, network.copies)}")
     if not network.copies:
         return network, stock, flow
     regions = {node: region for region, nodes in network.copies.items() for node in nodes if region not in open_copies}

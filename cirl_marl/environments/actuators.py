@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import ArrayLike
 
-from cirl_marl.errors import CirlError, ControlError, unknown
+from cirl_marl.errors import CirlError, ControlError, unknown_name
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.rowsum import single_column, spans
 
@@ -109,7 +109,7 @@ class Actuators:
     def _wrong_agents(self, actions: Mapping[str, object]) -> str:
         for agent in actions:
             if agent not in self.agents:
-                return f"actions: {unknown('agent', agent, self.agents)}"
+                return f"actions: {unknown_name('agent', agent, self.agents)}"
         return f"actions are missing for {[agent for agent in self.agents if agent not in actions]}"
 
     def _wrong_values(self, actions: Floats) -> str:
@@ -135,7 +135,7 @@ def _acting_agents(network: Network, agents: Sequence[str] | None) -> tuple[str,
         if agent in network.compartments and agent not in network.control_rows:
             raise CirlError(f"network '{network.name}': '{agent}' has no control, so that it cannot act")
         if agent not in network.control_rows:
-            raise CirlError(f"network '{network.name}': {unknown('agent', agent, network.controllable)}")
+            raise CirlError(f"network '{network.name}': {unknown_name('agent', agent, network.controllable)}")
     if (network.agents and not ids) or len(set(ids)) != len(ids):
         raise CirlError(f"network '{network.name}': agents {list(ids)} must be distinct and at least one")
     return ids

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cirl_marl.environments.parallel import METADATA, OPTIONS, NetworkParallelEnv, check_options, first_copy
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, ControlError, unknown
+from cirl_marl.errors import CirlError, ControlError, unknown_name
 from cirl_marl.network import Floats, Network
 
 Observation = NDArray[np.float32]
@@ -112,7 +112,7 @@ class JointVectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArra
         modes = {mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)}
         mode = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
         if mode not in modes:
-            raise CirlError(unknown("autoreset_mode", mode, modes))
+            raise CirlError(unknown_name("autoreset_mode", mode, modes))
         self.batch = MultiAgentVectorEnv(network, num_envs=num_envs, **options)
         if not self.batch.agents:
             raise CirlError(f"network '{self.batch.network.name}': no compartment has a control, so nothing can act")

@@ -9,7 +9,7 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from cirl_marl.dynamics.integrator import Dynamics
-from cirl_marl.errors import CirlError, unknown
+from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import OBSERVE, Arc
 from cirl_marl.network.rowsum import spans
@@ -55,7 +55,7 @@ class ObservationLayout:
         network = dynamics.network
         mode = network.observation.mode if mode is None else mode
         if mode not in OBSERVE:
-            raise CirlError(f"observe: {unknown('observation mode', mode, OBSERVE)}")
+            raise CirlError(f"observe: {unknown_name('observation mode', mode, OBSERVE)}")
         if mode == "stocks" and not network.observation.nodes:
             raise CirlError(f"observe: mode 'stocks' needs a scenario that lists the nodes; '{network.name}' has none")
         for agent in agents:

@@ -15,7 +15,7 @@ from pettingzoo.utils import conversions
 from cirl_marl.environments.actuators import wrong_shape
 from cirl_marl.environments.state import Outcome, Snapshot
 from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv, Observations
-from cirl_marl.errors import CirlError, ControlError, unknown
+from cirl_marl.errors import CirlError, ControlError, unknown_name
 from cirl_marl.network import Floats, Network
 
 RENDER_MODES = ("rgb_array", "human")
@@ -27,7 +27,7 @@ def check_options(options: Iterable[str], choices: Sequence[str], *arguments: st
     """Refuse options that are not among the ``choices``; ``arguments`` are those that have a place of their own."""
     for option in options:
         if option not in choices:
-            raise CirlError(unknown("option", option, (*choices, *arguments)))
+            raise CirlError(unknown_name("option", option, (*choices, *arguments)))
 
 
 class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):  # type: ignore[misc]
@@ -61,7 +61,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         """Make the environment; ``options`` and errors are those of ``MultiAgentVectorEnv``."""
         check_options(options, OPTIONS, "scenario", "agents", "reward", "render_mode")
         if render_mode is not None and render_mode not in RENDER_MODES:
-            raise CirlError(unknown("render_mode", render_mode, RENDER_MODES))
+            raise CirlError(unknown_name("render_mode", render_mode, RENDER_MODES))
         self.batch = MultiAgentVectorEnv(
             network, num_envs=1, scenario=scenario, agents=agents, reward=reward, **options
         )

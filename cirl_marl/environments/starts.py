@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cirl_marl.dynamics.integrator import Dynamics
-from cirl_marl.errors import ControlError, unknown
+from cirl_marl.errors import ControlError, unknown_name
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.compartment_model import DiscreteTimeModel, GoalTask
 from cirl_marl.network.initial_ages import age_shares
@@ -117,7 +117,7 @@ class Starts:
             raise ControlError(f"reset options must be a mapping, not {options!r}")
         for key in options:
             if key not in ("initial_state", "options"):  # PettingZoo's own test passes the key "options"
-                raise ControlError(f"reset options: {unknown('option', key, ['initial_state'])}")
+                raise ControlError(f"reset options: {unknown_name('option', key, ['initial_state'])}")
         state = options.get("initial_state", {})
         if not isinstance(state, Mapping):
             names = self._array_order
@@ -130,7 +130,7 @@ class Starts:
             state = dict(zip(names, values, strict=True))
         for id_ in state:
             if id_ not in self._rows:
-                raise ControlError(f"initial_state: {unknown('node or inner state', id_, self._rows)}")
+                raise ControlError(f"initial_state: {unknown_name('node or inner state', id_, self._rows)}")
         for id_, rows in self._stages.items():
             stages = [self.names[row] for row in rows if self.names[row] in state]
             if stages and id_ in state:

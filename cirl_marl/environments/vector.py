@@ -23,7 +23,7 @@ from cirl_marl.environments.rewards import Credit
 from cirl_marl.environments.scoring import Scoring
 from cirl_marl.environments.starts import Starts
 from cirl_marl.environments.state import Outcome, Snapshot, State
-from cirl_marl.errors import CirlError, ControlError, unknown
+from cirl_marl.errors import CirlError, ControlError, unknown_name
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.calendar import years
 from cirl_marl.network.elements import MOMENTS, REWARDS
@@ -448,7 +448,7 @@ def _share(weight: float) -> float:
 
 def _choice(option: str, value: str, choices: Sequence[str]) -> str:
     if value not in choices:
-        raise CirlError(unknown(option, value, choices))
+        raise CirlError(unknown_name(option, value, choices))
     return value
 
 

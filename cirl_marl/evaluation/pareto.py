@@ -19,7 +19,7 @@ from cirl_marl.evaluation.contenders import differences
 from cirl_marl.jobs import Standing, Tell, check_place, raise_first, run_jobs
 from cirl_marl.learners import Recipe, RunDirectory, load_recipe
 from cirl_marl.network import Floats, Network
-from cirl_marl.optimum import Bound, Envelope, NoCertificate, achieved, bound, improved
+from cirl_marl.optimum import Bound, Envelope, NoCertificate, bound, improve_plan, simulate_plan
 from cirl_marl.optimum.bounds import highest_service
 from cirl_marl.optimum.mpc import SERVICE_FIRST
 
@@ -236,8 +236,8 @@ def _possible(network: Network, points: int, progress: ProgressReport) -> tuple[
         solution = bound(network, min_service=level, near=bounds[-1] if bounds else None)
         bounds.append(solution)
         results.append(Point(kind="bound", service=level, circularity=solution.objective))
-        episode = achieved(
-            improved(solution, progress=part_of(progress, "bounds and plans", place / points, 1 / points))
+        episode = simulate_plan(
+            improve_plan(solution, progress=part_of(progress, "bounds and plans", place / points, 1 / points))
         )
         service, circularity = float(episode.least_service[0]), float(episode.episode_circularity[0])
         results.append(Point(kind="plan", service=service, circularity=circularity))

@@ -14,7 +14,7 @@ from cirl_marl.controllers.basic import Neutral
 from cirl_marl.controllers.rollout import episode_start, rollout
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, unknown
+from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.importing.balances import Change, Processes, ProcessKind, Residual
 from cirl_marl.importing.definition import ImportedFiles, definition_files, identifiers
 from cirl_marl.importing.flow_table import FlowTable, read_flows, read_stocks
@@ -127,7 +127,7 @@ def _matching_processes(table: FlowTable, patterns: Sequence[str], label: str) -
     for pattern in patterns:
         matches = [name for name in names if fnmatchcase(name, pattern)]
         if not matches:
-            raise CirlError(f"{table.name}: {label}: {unknown('process', pattern, names)}")
+            raise CirlError(f"{table.name}: {label}: {unknown_name('process', pattern, names)}")
         processes += matches
     return list(dict.fromkeys(processes))
 
@@ -136,7 +136,7 @@ def _stock_processes(table: FlowTable, stocks: Mapping[tuple[str, str, int], flo
     regions = {region for region, _, _ in stocks}
     for region in regions:
         if region not in table.regions:
-            raise CirlError(f"stocks: {unknown('region', region, table.regions)}")
+            raise CirlError(f"stocks: {unknown_name('region', region, table.regions)}")
     return list(dict.fromkeys(process for _, process, _ in stocks))
 
 

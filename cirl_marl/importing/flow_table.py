@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated
 from zipfile import BadZipFile
 
-from cirl_marl.errors import CirlError, unknown
+from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.network.units import factor
 
@@ -76,7 +76,7 @@ class FlowTable:
         """
         for region in regions:
             if region not in self.regions:
-                raise CirlError(f"{self.name}: {unknown('region', region, self.regions)}")
+                raise CirlError(f"{self.name}: {unknown_name('region', region, self.regions)}")
         selection = {key: value for key, value in self.flows.items() if key[0] in regions}
         return replace(self, flows=selection)
 
@@ -323,7 +323,7 @@ def _sheets(path: Path, sheet: str | None) -> Iterator[_Grid]:
         raise CirlError(f"{path}: is no workbook that can be read: {error}") from error
     try:
         if sheet is not None and sheet not in book.sheetnames:
-            raise CirlError(f"{path}: {unknown('sheet', sheet, book.sheetnames)}")
+            raise CirlError(f"{path}: {unknown_name('sheet', sheet, book.sheetnames)}")
         years = [text for text in book.sheetnames if _is_year(text)]
         for name in [sheet] if sheet is not None else years or book.sheetnames[:1]:
             rows = enumerate(book[name].iter_rows(values_only=True), start=1)

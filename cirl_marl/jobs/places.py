@@ -13,7 +13,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, Protocol
 
-from cirl_marl.errors import CirlError, unknown
+from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.jobs.slurm import Slurm, sbatch_options
 from cirl_marl.jobs.work import Work
 
@@ -205,7 +205,7 @@ def check_place(on: str, workers: int | None = None, settings: Mapping[str, str]
         CirlError: for an unknown place, workers or settings that it does not take, or a package that is missing.
     """
     if on not in PLACES:
-        raise CirlError(unknown("place", on, PLACES))
+        raise CirlError(unknown_name("place", on, PLACES))
     if settings and on != "slurm":
         raise CirlError(f"--slurm {_settings(settings)}: goes with --on slurm, not with --on {on}")
     if workers is not None and workers < 1:

@@ -23,7 +23,7 @@ from stable_baselines3.common.policies import BasePolicy, MultiInputActorCriticP
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
-from cirl_marl.errors import RecipeError, unknown
+from cirl_marl.errors import RecipeError, unknown_name
 from cirl_marl.learners.central_critic import CentralCriticPolicy
 from cirl_marl.learners.views import CENTRAL_CRITIC
 
@@ -68,7 +68,7 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
     """
     classes = every_algorithm()
     if name not in classes:
-        raise RecipeError(f"algorithm: {unknown('algorithm', name, classes)}")
+        raise RecipeError(f"algorithm: {unknown_name('algorithm', name, classes)}")
     return classes[name]
 
 
@@ -82,14 +82,14 @@ def algorithm_mistakes(name: str, policy: str, parameters: Mapping[str, Any]) ->
     """Yield what is wrong with an algorithm, its policy and its parameters: key, value and what would do."""
     classes = algorithms()
     if name not in classes:
-        yield f"algorithm: {unknown('algorithm', name, classes)}"
+        yield f"algorithm: {unknown_name('algorithm', name, classes)}"
         return
     aliases = classes[name].policy_aliases
     fit = [alias for alias in aliases if not alias.startswith(("Cnn", "MultiInput"))]
     if aliases.get("MultiInputPolicy") is MultiInputActorCriticPolicy:
         fit.append(CENTRAL_CRITIC)
     if policy not in fit:
-        yield f"policy: {unknown(f'policy of {name} for vectors', policy, fit)}"
+        yield f"policy: {unknown_name(f'policy of {name} for vectors', policy, fit)}"
     yield from parameter_mistakes(name, parameters)
 
 
@@ -103,7 +103,7 @@ def parameter_mistakes(name: str, parameters: Mapping[str, Any]) -> Iterator[str
     for key, value in parameters.items():
         place = f"parameters.{key}"
         if key not in signature:
-            yield f"parameters: {unknown(f'parameter of {name}', key, signature)}"
+            yield f"parameters: {unknown_name(f'parameter of {name}', key, signature)}"
         elif infinite := list(_not_finite(place, value)):
             yield from infinite
         elif not _takes(signature[key], value):
@@ -159,7 +159,7 @@ def _noise_mistakes(place: str, noise: object) -> Iterator[str]:
     if not isinstance(noise, Mapping) or set(noise) != {"kind", "sigma"} or not _are_amounts([noise["sigma"]]):
         yield f"{place}: needs kind and a number sigma of at least 0, got {noise!r}"
     elif noise["kind"] not in NOISES:
-        yield f"{place}: {unknown('kind', noise['kind'], NOISES)}"
+        yield f"{place}: {unknown_name('kind', noise['kind'], NOISES)}"
 
 
 def _are_amounts(values: Iterable[object]) -> bool:

@@ -19,7 +19,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.definitions.reader import write_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, RecipeError, RunError, unknown
+from cirl_marl.errors import CirlError, RecipeError, RunError, unknown_name
 from cirl_marl.learners.agent_env import AgentVecEnv
 from cirl_marl.learners.algorithms import has_replay_buffer
 from cirl_marl.learners.learner import Learner, load_acting_learner
@@ -148,7 +148,7 @@ def prepare(
     full_recipe = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
     steps = full_recipe.run.steps if steps is None else _whole("steps", steps, 1)
     if engine is not None and engine not in ENGINES:
-        raise CirlError(unknown("engine", engine, ENGINES))
+        raise CirlError(unknown_name("engine", engine, ENGINES))
     if min_service is not None and not 0 <= min_service <= 1:
         raise CirlError(f"min_service must be a level in [0, 1], got {min_service}")
     run_options: dict[str, Any] = {} if engine is None else {"engine": engine}
@@ -288,7 +288,7 @@ def _check_options(options: Iterable[str], *functions: Callable[..., object]) ->
     names = dict.fromkeys((*OPTIONS, *keywords))
     for option in options:
         if option not in names:
-            raise CirlError(unknown("option", option, names))
+            raise CirlError(unknown_name("option", option, names))
 
 
 def _whole(name: str, value: object, least: int) -> int:

@@ -25,7 +25,7 @@ from cirl_marl.definitions.error_messages import validation_mistakes
 from cirl_marl.definitions.quantities import Number
 from cirl_marl.definitions.reader import read_toml
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import DefinitionError, RecipeError, unknown
+from cirl_marl.errors import DefinitionError, RecipeError, unknown_name
 from cirl_marl.learners.views import CENTRAL_CRITIC, Scheme, View, view_of
 from cirl_marl.network import Network
 from cirl_marl.network.elements import Moment, Node, Observe, Reward, Role
@@ -281,7 +281,7 @@ class Recipe(Settings):
     def check_agents(self, agents: Sequence[str]) -> None:
         """Raise a ``RecipeError`` for matches that name agents which do not act; it names the nearest that acts."""
         self._refuse(
-            f"match.{i}.agents: {unknown('agent', agent, agents)}"
+            f"match.{i}.agents: {unknown_name('agent', agent, agents)}"
             for i, match in enumerate(self.match)
             for agent in match.agents or ()
             if agent not in agents

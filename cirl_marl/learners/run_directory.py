@@ -38,7 +38,7 @@ from pydantic import Field, StrictInt, ValidationError, field_validator
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.definitions.error_messages import validation_mistakes
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import RunError, unknown
+from cirl_marl.errors import RunError, unknown_name
 from cirl_marl.learners.recipe import OPTIONS, Group, Recipe, Settings
 from cirl_marl.network import Network
 from cirl_marl.records.files import refuse_links, sync, write_atomically, write_json
@@ -100,7 +100,7 @@ class RunConfig(Settings):
     def _are_known(cls, options: dict[str, Any]) -> dict[str, Any]:
         for name in options:
             if name not in OPTIONS:
-                raise ValueError(unknown("option", name, OPTIONS))
+                raise ValueError(unknown_name("option", name, OPTIONS))
         return options
 
 
@@ -364,7 +364,7 @@ class RunDirectory:
     def _json(self, name: str) -> dict[str, Any]:
         if not (self.path / "config.json").is_file():
             beside = sorted(str(config.parent) for config in self.path.parent.glob("*/config.json"))
-            hint = f": {unknown('run', self.path, beside)}" if beside else ""
+            hint = f": {unknown_name('run', self.path, beside)}" if beside else ""
             raise RunError(f"no run in {self.path} (it has no config.json){hint}")
         path = self._file(name)
         try:

@@ -17,7 +17,7 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, RecipeError, unknown
+from cirl_marl.errors import CirlError, RecipeError, unknown_name
 from cirl_marl.learners.checkpoint import freeze_statistics, set_variables, variables
 from cirl_marl.learners.demonstrations import keep_parameters
 from cirl_marl.learners.learner import Learner, load_acting_learner
@@ -49,7 +49,7 @@ def begin_from(start: Start, learner: Learner, env: MultiAgentVectorEnv, seed: i
 def _begin_from(run: RunDirectory, name: str, learner: Learner, env: MultiAgentVectorEnv) -> Origin:
     groups = {part.name: part for part in run.groups()}
     if name not in groups:
-        raise RecipeError(f"{run.path}: {unknown('agent', name, groups)}")
+        raise RecipeError(f"{run.path}: {unknown_name('agent', name, groups)}")
     group, source, folder = groups[name], run.make_env(1), run.acting_checkpoint
     view = learner.agent_env.view
     _refuse(f"{run.path}: '{name}'", [*_other_settings(group.spec, learner.spec)])

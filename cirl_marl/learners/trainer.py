@@ -20,7 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from cirl_marl.environments.rewards import CIRCULARITY_REWARDS
 from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, RecipeError, RunError, unknown
+from cirl_marl.errors import CirlError, RecipeError, RunError, unknown_name
 from cirl_marl.learners.checkpoint import read_tree, write_tree
 from cirl_marl.learners.demonstrations import Demonstrator
 from cirl_marl.learners.learner import Learner, derived_seed, has_tensorboard
@@ -194,7 +194,7 @@ class Training:
         """Raise a ``CirlError`` for callbacks of learners that there are not, or that run as one with others."""
         for name in callbacks:
             if name not in self.learners:
-                raise CirlError(f"callbacks: {unknown('learner', name, self.learners)}")
+                raise CirlError(f"callbacks: {unknown_name('learner', name, self.learners)}")
             if self.config.recipe.run.engine == "stacked":
                 title = self.learners[name].agent_env.title
                 raise CirlError(f"callbacks: {title}: engine stacked calls none; use engine lockstep or auto")

@@ -21,7 +21,7 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar, dataclass_trans
 
 import numpy as np
 
-from cirl_marl.errors import NetworkError, unknown
+from cirl_marl.errors import NetworkError, unknown_name
 
 Kind = Literal["mass", "time", "rate", "flow", "steps", "1"]
 """Kinds of quantity; a rate is 1/time, a flow mass/time, steps count control intervals."""
@@ -220,7 +220,7 @@ def check_types(owner: str, part_: Any) -> None:
             continue  # by far the most usual
         if isinstance(declaration, Word) and isinstance(declaration.of, type):
             if value not in declaration.of.__members__.values():
-                raise NetworkError(owner, [unknown(declaration.label or name, value, declaration.of)])
+                raise NetworkError(owner, [unknown_name(declaration.label or name, value, declaration.of)])
             object.__setattr__(part_, name, declaration.of(value))
         elif fault := declaration.problem(value) or _plain_problem(value, hint):
             faults.append(f"{name} must be {fault}")
@@ -259,7 +259,7 @@ def bound_problems(part_: Any, prefix: str = "") -> Iterator[str]:
     for name, declaration in declarations(type(part_)).items():
         value = getattr(part_, name)
         if isinstance(declaration, Word) and value not in declaration.of:
-            yield f"{prefix}{unknown(declaration.label or name, value, declaration.of)}"
+            yield f"{prefix}{unknown_name(declaration.label or name, value, declaration.of)}"
         elif isinstance(declaration, Quantity) and value is not None:
             for number in value.extremes if isinstance(value, TimeDependent) else (value,):
                 if fault := declaration.bound_problem(number):

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from cirl_marl.errors import CirlError, NetworkError, unknown
+from cirl_marl.errors import CirlError, NetworkError, unknown_name
 from cirl_marl.network.declarations import declarations
 from cirl_marl.network.elements import SINKS, Arc, Compartment, ControlKind, Law, Node, Role, Service
 from cirl_marl.network.initial_ages import remaining_history
@@ -61,7 +61,7 @@ class Network(Specification):
         if not isinstance(name, str) or name not in self.scenarios:
             names = sorted({self.scenario_name, *self.scenarios})
             hint = "" if self.scenarios else " A network with other options has no other scenarios: choose it first."
-            raise CirlError(f"network '{self.name}': {unknown('scenario', name, names)}{hint}")
+            raise CirlError(f"network '{self.name}': {unknown_name('scenario', name, names)}{hint}")
         network: Network = self.scenarios[name]
         return network
 
@@ -76,10 +76,10 @@ class Network(Specification):
         """
         for group, values in groups.items():
             if group not in (options := ["episode", "objective", "observation"]):
-                raise CirlError(f"with_options: {unknown('group', group, options)}")
+                raise CirlError(f"with_options: {unknown_name('group', group, options)}")
             options = [item.name for item in fields(getattr(self, group))]
             for name in [item for item in values if item not in options]:
-                raise CirlError(f"with_options: {group}: {unknown('field', name, options)}")
+                raise CirlError(f"with_options: {group}: {unknown_name('field', name, options)}")
         changes = {group: replace(getattr(self, group), **dict(values)) for group, values in groups.items()}
         return replace(self, **changes, scenarios={})
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 from scipy import special
 
-from cirl_marl.errors import unknown
+from cirl_marl.errors import unknown_name
 from cirl_marl.network.declarations import CheckedRecord, Positive, Quantity, Word, declarations, frozen_record
 from cirl_marl.network.elements import FIXED_LIFETIME, Arc, Law, Node, Service
 from cirl_marl.network.rowsum import Floats
@@ -193,7 +193,7 @@ def _uncertain_field(network: Specification, path: str) -> tuple[Any, str]:
         raise KeyError(f"only numbers of {', '.join(KINDS)} can be uncertain")
     parts = {part.id: part for part in getattr(network, kind)}
     if id_ not in parts:
-        raise KeyError(unknown(kind[:-1], id_, parts))
+        raise KeyError(unknown_name(kind[:-1], id_, parts))
     fields = declarations(KINDS[kind])
     options = [
         field

@@ -4,8 +4,8 @@ from cirl_marl.optimum.admissible import NoCertificate
 from cirl_marl.optimum.bounds import Bound, Envelope, bound, envelope, gap
 from cirl_marl.optimum.certificate import Certificate, Verification
 from cirl_marl.optimum.cross_entropy import Incumbent, search, search_each, standard_candidates
-from cirl_marl.optimum.improve import improved
-from cirl_marl.optimum.planned_episodes import Plan, achieved
+from cirl_marl.optimum.improve import improve_plan
+from cirl_marl.optimum.planned_episodes import Plan, simulate_plan
 
 __all__ = [
     "Bound",
@@ -15,12 +15,12 @@ __all__ = [
     "NoCertificate",
     "Plan",
     "Verification",
-    "achieved",
     "bound",
     "envelope",
     "gap",
-    "improved",
+    "improve_plan",
     "search",
     "search_each",
+    "simulate_plan",
     "standard_candidates",
 ]

@@ -25,7 +25,7 @@ from cirl_marl.network import Floats
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
 from cirl_marl.optimum.bounds import Bound
 from cirl_marl.optimum.matrices import Layout
-from cirl_marl.optimum.planned_episodes import achieved
+from cirl_marl.optimum.planned_episodes import simulate_plan
 from cirl_marl.optimum.program import LinearProgram, Programs
 from cirl_marl.optimum.solver import Infeasible, SolverFailure, best_values, solve
 
@@ -45,7 +45,7 @@ TOLERATED_SHORTFALL = 1e-4
 """What a service may lack of its demand without a further round."""
 
 
-def improved(
+def improve_plan(
     bound: Bound,
     *,
     rounds: int = 20,
@@ -70,7 +70,7 @@ def improved(
     if bound.actions.shape[0] * inputs * (dynamics.rows.nodes.stop + len(bound.network.arcs)) > MOST_SLOPES:
         return refine(bound, enough=enough, progress=progress)
     price = prices(bound)
-    best, run = bound, achieved(bound)
+    best, run = bound, simulate_plan(bound)
     value, trust, slopes = penalised_objective(bound, run, price), TRUST, None
     for done in range(rounds):
         if trust < SMALLEST or enough(run):
@@ -82,7 +82,7 @@ def improved(
             trust /= 4
             continue
         candidate = replace(best, actions=np.clip(best.actions + step, -1.0, 1.0))
-        trial = achieved(candidate)
+        trial = simulate_plan(candidate)
         gain = penalised_objective(bound, trial, price) - value
         if gain > 0:
             best, run, value, trust, slopes = candidate, trial, value + gain, min(1.0, 2 * trust), None
@@ -285,7 +285,7 @@ def refine(
         progress: called with the share of them that is solved; 1 when no more are needed.
     """
     admissible = Admissible.of(bound.network, bound.agents or None)
-    price, best, run = prices(bound), bound, achieved(bound)
+    price, best, run = prices(bound), bound, simulate_plan(bound)
     value = penalised_objective(bound, run, price)
     factor = 1.0 + _shortfall(bound.problem.layout, bound.solution, run, 1.0)
     for done in range(rounds):
@@ -301,7 +301,7 @@ def refine(
         layout = programs.layout
         actions = normalised_actions(demand_ranges, layout, variables.reshape(-1, layout.size))
         candidate = replace(bound, actions=actions)
-        trial = achieved(candidate)
+        trial = simulate_plan(candidate)
         progress((done + 1) / rounds)
         if (worth := penalised_objective(bound, trial, price)) > value:
             best, run, value = candidate, trial, worth

@@ -28,7 +28,7 @@ from cirl_marl.network import Floats
 from cirl_marl.optimum.admissible import Admissible, NoCertificate, normalised_actions
 from cirl_marl.optimum.bounds import Bound, bound
 from cirl_marl.optimum.cross_entropy import KNOTS, Incumbent, search_each
-from cirl_marl.optimum.improve import improved
+from cirl_marl.optimum.improve import improve_plan
 from cirl_marl.optimum.options import check_options, demanded_levels
 from cirl_marl.optimum.planned_episodes import Plan, starting_states
 from cirl_marl.optimum.program import Program, Programs
@@ -336,7 +336,7 @@ class Optimum(Planner):
                 agents=env.agents or None,
             )
             report(0.0)
-            plans.append(improved(solution, progress=report))
+            plans.append(improve_plan(solution, progress=report))
             by_start[key] = plans[-1]
         return plans
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cirl_marl.dynamics.state_layout import StateLayout
-from cirl_marl.errors import CirlError, unknown
+from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.initial_ages import age_shares
 from cirl_marl.optimum.vintages import Lifetimes
@@ -32,7 +32,7 @@ def starting_stocks(lifetimes: Lifetimes, initial: Mapping[str, float] | ArrayLi
     if isinstance(initial, Mapping):
         for node, stock in initial.items():
             if node not in stores:
-                raise CirlError(f"initial: {unknown('node', node, stores)}")
+                raise CirlError(f"initial: {unknown_name('node', node, stores)}")
             start[stores[node]] = stock
     elif initial is not None:
         start = np.asarray(initial, dtype=float)

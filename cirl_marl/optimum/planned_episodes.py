@@ -93,7 +93,7 @@ class Plan(Controller):
             raise ControlError(f"plan: it starts from {amount}, copy {copy} from {start[row]:g}")
 
 
-def achieved(bound: Bound) -> Rollout:
+def simulate_plan(bound: Bound) -> Rollout:
     """Return the episode that the plan of ``bound`` makes in the simulator."""
     network = bound.network
     stores = [replace(n, initial=(x, x)) for n, x in zip(network.stores, bound.stock[0].tolist(), strict=True)]

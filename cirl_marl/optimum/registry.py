@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from cirl_marl.controllers.basic import Constant, Controller, Neutral, Random
 from cirl_marl.controllers.lqr import LQR
 from cirl_marl.controllers.scripted import ScriptController
-from cirl_marl.errors import CirlError, unknown
+from cirl_marl.errors import CirlError, unknown_name
 
 SETTABLE = ("constant", "scripted")
 """Controllers that take values for single agents."""
@@ -31,7 +31,7 @@ def named_controller(
         CirlError: for an unknown name, or options that the controller does not take.
     """
     if name not in CONTROLLERS:
-        raise CirlError(unknown("control", name, CONTROLLERS))
+        raise CirlError(unknown_name("control", name, CONTROLLERS))
     if constants and name not in SETTABLE:
         raise CirlError(f"values of single agents go with {' or '.join(SETTABLE)} control, not with {name}")
     if min_service is not None and name not in ("mpc", "optimum"):

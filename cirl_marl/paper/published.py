@@ -13,7 +13,7 @@ from pathlib import Path
 from pydantic import TypeAdapter
 
 from cirl_marl.definitions.reader import read_toml
-from cirl_marl.errors import CirlError, unknown
+from cirl_marl.errors import CirlError, unknown_name
 
 SOURCE = "Zocco, Corti, Malvezzi: CiRL, arXiv 2505.21536"
 HARDWARE = "Tesla T4"
@@ -100,5 +100,5 @@ def environment_of(name: str) -> PaperEnvironment:
     200000
     """
     if name not in ENVIRONMENTS:
-        raise CirlError(unknown("environment of the paper", name, ENVIRONMENTS))
+        raise CirlError(unknown_name("environment of the paper", name, ENVIRONMENTS))
     return ENVIRONMENTS[name]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from cirl_marl.definitions.catalogue import recipes
-from cirl_marl.errors import CirlError, unknown
+from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.paper.published import ALGORITHMS, ENVIRONMENTS, PaperEnvironment, environment_of
 from cirl_marl.paper.results import PaperRow
 
@@ -28,11 +28,11 @@ def select_rows(
         CirlError: for a name that does not exist, or a combination that the paper did not run.
     """
     if settings is not None and settings not in SETTINGS:
-        raise CirlError(f"--recipe: {unknown('settings', settings, SETTINGS)}")
+        raise CirlError(f"--recipe: {unknown_name('settings', settings, SETTINGS)}")
     if environment in ALGORITHMS:
         raise CirlError(f"{environment} is an algorithm, which comes after an environment: {', '.join(ENVIRONMENTS)}")
     if algorithm is not None and algorithm not in ALGORITHMS:
-        raise CirlError(unknown("algorithm of the paper", algorithm, ALGORITHMS))
+        raise CirlError(unknown_name("algorithm of the paper", algorithm, ALGORITHMS))
     names = [] if settings == "tuned" else [(*run, "published") for run in _published_rows(environment, algorithm)]
     if settings != "published":
         only = environment is not None and settings == "tuned"

@@ -14,7 +14,7 @@ from typing import Annotated
 import numpy as np
 
 from cirl_marl.drawing.style import readable
-from cirl_marl.errors import CirlError, unknown
+from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.network.elements import Arc, Node, Role
@@ -139,7 +139,7 @@ def objective_terms(network: Network, kinds: Sequence[str] = KINDS) -> list[Obje
     """
     for kind in kinds:
         if kind not in KINDS:
-            raise CirlError(f"terms: {unknown('kind', kind, KINDS)}")
+            raise CirlError(f"terms: {unknown_name('kind', kind, KINDS)}")
     weighable: list[ObjectiveTerm] = []
     if "circularity" in kinds:
         parts: dict[str, Floats] = {}

@@ -16,7 +16,7 @@ from cirl_marl.dynamics.stages import simulated_network
 from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, RunError, unknown
+from cirl_marl.errors import CirlError, RunError, unknown_name
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum.options import by_stage
@@ -107,7 +107,7 @@ class _Table:
     def column(self, name: str, first: int = 0) -> Floats:
         """Return the numbers of a column from a row on."""
         if name not in self.header:
-            raise CirlError(f"{self.path}: {unknown('column', name, self.header)} It is no plan of this network")
+            raise CirlError(f"{self.path}: {unknown_name('column', name, self.header)} It is no plan of this network")
         place, numbers = self.header.index(name), []
         for line, row in enumerate(self.rows[first:], first + 2):
             try:
@@ -127,7 +127,7 @@ def _simulated_episode(network: Network, table: _Table) -> PlannedEpisode:
     for name in table.header:
         if name.startswith(("stock of ", "flow of ")) and name not in {*stocks, *flows}:
             columns = sorted({*stocks, *flows})
-            raise CirlError(f"{table.path}: {unknown('column', name, columns)} It is a plan of another network")
+            raise CirlError(f"{table.path}: {unknown_name('column', name, columns)} It is a plan of another network")
     stock = np.array([table.column(name) for name in stocks]).T
     flow = np.array([table.column(name, 1) for name in flows]).T
     initial = by_stage(network, StateLayout(simulated_network(network)), stock[0])

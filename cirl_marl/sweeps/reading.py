@@ -13,7 +13,7 @@ from cirl_marl.definitions.catalogue import file_and_region, load_network, netwo
 from cirl_marl.definitions.error_messages import validation_mistakes
 from cirl_marl.definitions.quantities import Number
 from cirl_marl.definitions.reader import read_toml
-from cirl_marl.errors import CirlError, DefinitionError, unknown
+from cirl_marl.errors import CirlError, DefinitionError, unknown_name
 from cirl_marl.learners.recipe import Count, EngineName, Recipe, Settings, load_recipe
 from cirl_marl.network import Network
 from cirl_marl.network.elements import Moment, Observe, Reward
@@ -124,7 +124,7 @@ def _unknown_names(sound: Mapping[str, Sequence[str]]) -> Iterator[str]:
         present = [network.scenario_name, *network.scenarios]
         for name in sound.get("scenarios", ()):
             if name not in present:
-                yield f"scenarios: network '{network.name}': {unknown('scenario', name, present)}"
+                yield f"scenarios: network '{network.name}': {unknown_name('scenario', name, present)}"
 
 
 def _read(
@@ -132,5 +132,5 @@ def _read(
 ) -> Network | Recipe:
     """Read a network or recipe; one without a name at all is refused in the same words as an unknown one."""
     if not name.strip():
-        raise CirlError(unknown(kind, name, names()))
+        raise CirlError(unknown_name(kind, name, names()))
     return read(name)

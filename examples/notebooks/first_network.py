@@ -73,7 +73,7 @@ pyplot.show()
 
 # %%
 best = cirl_marl.bound(network, {"households": 100.0}, min_service=1.0)
-plan = cirl_marl.achieved(cirl_marl.improved(best))
+plan = cirl_marl.simulate_plan(cirl_marl.improve_plan(best))
 print(best)
 print(f"in the simulator the plan reaches {plan.episode_circularity[0]:.3f} t", end=", ")
 print(f"{cirl_marl.gap(best.objective, plan.episode_circularity[0]):.2%} from the bound")

@@ -70,8 +70,8 @@ for service in network.services:
 # %%
 best = cirl_marl.bound(network, min_service=1.0)
 print(best)
-better = cirl_marl.improved(best)
-episode = cirl_marl.achieved(better)
+better = cirl_marl.improve_plan(best)
+episode = cirl_marl.simulate_plan(better)
 usual = cirl_marl.rollout(cirl_marl.vector_env(network, num_envs=1), cirl_marl.Neutral())
 print(f"as usual λ̄ = {usual.episode_circularity[0] / 1e3:.1f} Mt")
 print(f"plan     λ̄ = {episode.episode_circularity[0] / 1e3:.1f} Mt, lowest service {episode.least_service[0]:.4f}")

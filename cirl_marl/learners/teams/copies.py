@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import aec_to_parallel, turn_based_aec_to_parallel
 
-from cirl_marl.errors import CirlError, LearnerError, unknown
+from cirl_marl.errors import CirlError, LearnerError, unknown_name
 from cirl_marl.learners.views import by_part
 from cirl_marl.network import Floats
 
@@ -152,7 +152,7 @@ class Copies:
             name = str(native)
             if name not in self._native_names:
                 raise LearnerError(
-                    f"copy {i} of the environment: possible_agents: {unknown('agent', name, self.agents)}"
+                    f"copy {i} of the environment: possible_agents: {unknown_name('agent', name, self.agents)}"
                 )
             if name in finished_agents:
                 raise LearnerError(f"{self._label(i, name)}: its episode has ended, and it is still in env.agents")

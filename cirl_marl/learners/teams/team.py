@@ -19,7 +19,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.preprocessing import is_image_space
 
-from cirl_marl.errors import CirlError, RecipeError, RunError, unknown
+from cirl_marl.errors import CirlError, RecipeError, RunError, unknown_name
 from cirl_marl.learners.algorithms import RESERVED_PARAMETERS, every_algorithm
 from cirl_marl.learners.checkpoint import read_tree, write_tree
 from cirl_marl.learners.learner import TENSORBOARD_ADVICE, Learner, derived_seed, has_tensorboard, predict_action
@@ -65,7 +65,7 @@ def independent(
     settings = {}
     for pattern in overrides or {}:
         if not any(fnmatchcase(agent, pattern) for agent in copies.agents):
-            raise CirlError(f"overrides: {unknown('agent', pattern, copies.agents)}")
+            raise CirlError(f"overrides: {unknown_name('agent', pattern, copies.agents)}")
     for agent in copies.agents:
         fit = (kind for pattern, kind in (overrides or {}).items() if fnmatchcase(agent, pattern))
         settings[agent] = _settings(agent, next(fit, algorithm), copies.observation_spaces[agent], normalise)
@@ -110,7 +110,7 @@ class Team:
     def __getitem__(self, agent: str) -> BaseAlgorithm:
         """Return the model of an agent; a ``CirlError`` names the nearest if there is none."""
         if str(agent) not in self.learners:
-            raise CirlError(unknown("agent", str(agent), self.agents))
+            raise CirlError(unknown_name("agent", str(agent), self.agents))
         return self.learners[str(agent)].model
 
     def __iter__(self) -> Iterator[str]:
@@ -136,7 +136,7 @@ class Team:
             raise CirlError(f"total_timesteps must be at least 1, got {total_timesteps}")
         for agent in callbacks or {}:
             if agent not in self.learners:
-                raise CirlError(f"callbacks: {unknown('agent', agent, self.agents)}")
+                raise CirlError(f"callbacks: {unknown_name('agent', agent, self.agents)}")
         joint = self.world.joint_steps + math.ceil(total_timesteps / self._copies.num_envs)
         with global_streams_claimed(), one_torch_thread(), Bar(disable=not progress_bar) as bar:
             task = bar.add_task(f"{len(self.agents)} learners", total=joint - self.world.joint_steps)
@@ -273,7 +273,7 @@ def _settings(agent: str, algorithm: Algorithm, space: spaces.Space[Any], normal
     name = getattr(bound_algorithm.func, "__name__", repr(bound_algorithm.func))
     classes = every_algorithm()
     if classes.get(name) is not bound_algorithm.func:
-        hint = unknown("algorithm of stable_baselines3 or sb3_contrib", name, classes)
+        hint = unknown_name("algorithm of stable_baselines3 or sb3_contrib", name, classes)
         raise RecipeError(f"agent '{agent}': {hint}")
     parameters = dict(bound_algorithm.keywords)
     policy_names = [*bound_algorithm.args, *([parameters.pop("policy")] if "policy" in parameters else [])]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 
-from cirl_marl.errors import CirlError, unknown
+from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network.compartment_model import model_faults
 from cirl_marl.network.declarations import bound_problems
 from cirl_marl.network.elements import IDENTIFIER, Arc, ControlKind, Law
@@ -80,7 +80,7 @@ def problems(network: Specification) -> Iterator[str]:
         if agent in compartments and agent not in actuators:
             yield f"agents: '{agent}' has no control, so that it cannot act"
         elif agent not in actuators:
-            yield f"agents: {unknown('agent', agent, actuators)}"
+            yield f"agents: {unknown_name('agent', agent, actuators)}"
     yield from repetitions("agents", network.default_agents)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from cirl_marl.errors import CirlError, unknown
+from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network.compartment_model import CompartmentModel, OutflowModel, ReleasingModel, Vehicle
 from cirl_marl.network.declarations import bound_problems, default_of
 from cirl_marl.network.elements import LAW_FIELDS, MAX_STEPS, Arc, Compartment, Control, ControlKind, Law, Node
@@ -39,7 +39,7 @@ def arc_problems(
     subject = f"arc '{arc.id}'"
     for end, node in (("from", arc.donor), ("to", arc.recipient)):
         if node not in nodes:
-            yield f"{subject}: {end}: {unknown('node', node, nodes)}"
+            yield f"{subject}: {end}: {unknown_name('node', node, nodes)}"
     if arc.donor == arc.recipient:
         yield f"{subject}: a cycle of zero delay: it returns to its own donor '{arc.donor}' without passing a stock"
     for name in SPECIAL_FIELDS:
@@ -51,7 +51,7 @@ def arc_problems(
         ends = (arc.donor, arc.recipient, arc.id)
         sources = [end for end in ends if end in compartments and isinstance(compartments[end].model, OutflowModel)]
         if arc.by not in sources:
-            yield f"{subject}: by: {unknown('compartment at this arc whose model gives a flow', arc.by, sources)}"
+            yield f"{subject}: by: {unknown_name('compartment at this arc whose model gives a flow', arc.by, sources)}"
     if arc.law is Law.BATCH and isinstance(arc.rate, Series):
         yield f"{subject}: rate: the mass of a unit cannot change in time"
     elif arc.law is Law.BATCH:
@@ -101,7 +101,7 @@ def _batch_problems(subject: str, arc: Arc, network: Specification, nodes: Mappi
         if arc.by != donor.id or not ports:
             yield f"{subject}: by: batches are released by the model of the donor '{donor.id}', which has ports {ports}"
         elif arc.port not in ports:
-            yield f"{subject}: {unknown('port', arc.port, ports)}"
+            yield f"{subject}: {unknown_name('port', arc.port, ports)}"
         if extremes(arc.rate)[0] <= 0:
             yield f"{subject}: law 'batch' with 'by' needs a positive rate, the mass per unit released"
         else:
@@ -177,7 +177,7 @@ def _model_problems(subject: str, compartment: Compartment, model: CompartmentMo
     quantities = ("stock_kg",) if isinstance(compartment, Node) else vehicle_quantities
     for name in model.context_names:
         if name not in quantities:
-            yield f"{subject}: context_names: {unknown('quantity told to this model', name, quantities)}"
+            yield f"{subject}: context_names: {unknown_name('quantity told to this model', name, quantities)}"
     states = model.ranged_states
     ranges = dict(zip(states, compartment.inner, strict=True)) if len(states) == len(compartment.inner) else {}
     if control is not None:

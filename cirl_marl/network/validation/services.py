@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from cirl_marl.errors import unknown
+from cirl_marl.errors import unknown_name
 from cirl_marl.network.compartment_model import MeasuringModel
 from cirl_marl.network.declarations import bound_problems
 from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Node, Service
@@ -53,14 +53,14 @@ def _service_problems(
     if service.provider in options and service.quantity == "measure":
         model = compartments[service.provider].model
         if isinstance(model, MeasuringModel) and service.measure not in model.measure_names:
-            yield f"{subject}: {unknown('measure', service.measure, model.measure_names)}"
+            yield f"{subject}: {unknown_name('measure', service.measure, model.measure_names)}"
     for place, id_ in enumerate(service.providers):
         key, provider = "also" if place else "provider", compartments.get(id_)
         if isinstance(provider, Node) and not provider.stores and service.quantity == "stock":
             yield f"{subject}: {key}: '{provider.id}' stores nothing; ask for its outflow"
         elif id_ not in options:
             kind = {"flow": "arc", "measure": "compartment that measures"}.get(service.quantity, "node")
-            yield f"{subject}: {key}: {unknown(kind, id_, options)}"
+            yield f"{subject}: {key}: {unknown_name(kind, id_, options)}"
     yield from repetitions(f"{subject}: also", service.providers)
     if service.also and service.quantity == "measure":
         yield f"{subject}: also: measures of several compartments do not add up; give each a service"
@@ -69,7 +69,7 @@ def _service_problems(
     yield from repetitions(f"{subject}: owed_by", service.owed_by)
     for debtor in service.owed_by:
         if debtor not in compartments:
-            yield f"{subject}: owed_by: {unknown('compartment', debtor, compartments)}"
+            yield f"{subject}: owed_by: {unknown_name('compartment', debtor, compartments)}"
     low, high = (np.array(network.interval_means(id_)) for id_ in (service.low, service.high))
     if extremes(service.low)[0] < 0:
         yield f"{subject}: low {extremes(service.low)[0]:g} must not be negative"
@@ -104,7 +104,7 @@ def supply_problems(network: Specification) -> Iterator[str]:
             if arc.weight is not None:
                 yield f"{subject}: weight: it makes up for no service; leave it out"
         elif arc.makes_up_for not in services:
-            yield f"{subject}: makes_up_for: {unknown('service', arc.makes_up_for, services)}"
+            yield f"{subject}: makes_up_for: {unknown_name('service', arc.makes_up_for, services)}"
         elif arc.law is not Law.CONTROLLED or kind is not ControlKind.FLOW:
             yield f"{subject}: makes_up_for needs law 'controlled' and a control of kind 'flow' of its own"
         else:
