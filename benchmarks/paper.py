@@ -20,11 +20,11 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from benchmarks.paper_document import markdown
 from cirl_marl.cli.common import shares
 from cirl_marl.errors import CirlError
-from cirl_marl.jobs import Standing, run_jobs
+from cirl_marl.jobs import JobStatus, run_jobs
 from cirl_marl.paper.published import BOX_ALGORITHMS, GOAL_ALGORITHMS
 from cirl_marl.paper.results import PaperRow, Results
-from cirl_marl.paper.running import RowJob, reason_to_repeat
-from cirl_marl.paper.selection import minutes, overview, select_rows
+from cirl_marl.paper.row_selection import minutes, overview, select_rows
+from cirl_marl.paper.rows import RowJob, reason_to_repeat
 from cirl_marl.paper.table import result_line
 
 console = Console(width=None if sys.stdout.isatty() else 140)
@@ -81,7 +81,7 @@ def main(
     path = write or (out / DOCUMENT.name if part else DOCUMENT)
     path.parent.mkdir(parents=True, exist_ok=True)
     comment = out / COMMENT
-    text = markdown(results.all(), comment.read_text(encoding="utf-8") if comment.is_file() else "")
+    text = markdown(results.read_all(), comment.read_text(encoding="utf-8") if comment.is_file() else "")
     path.write_text(text, encoding="utf-8")
     console.print(f"tables: {path}", soft_wrap=True)
     if failed:
@@ -134,7 +134,7 @@ def _run_once(results: Results, rows: Sequence[PaperRow], workers: int, episodes
     with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
         whole = bars.add_task("all rows", total=sum(minutes(row) for row in rows))
 
-        def watch(standings: Sequence[Standing]) -> None:
+        def watch(standings: Sequence[JobStatus]) -> None:
             busy = [f"{jobs[each.name].row}: {each.figures.get('what', '')}" for each in standings if _runs(each)]
             done = sum(minutes(jobs[each.name].row) * _trained(each) for each in standings)
             bars.update(whole, description=", ".join(busy), completed=done)
@@ -149,11 +149,11 @@ def _run_once(results: Results, rows: Sequence[PaperRow], workers: int, episodes
     return [jobs[failure.name].row for failure in failures]
 
 
-def _runs(each: Standing) -> bool:
+def _runs(each: JobStatus) -> bool:
     return each.state in ("running", "elsewhere")
 
 
-def _trained(each: Standing) -> float:
+def _trained(each: JobStatus) -> float:
     """Return the part of a row that is done; to evaluate takes next to nothing."""
     return each.share if each.figures.get("what") == "training" else float(each.state == "done")
 

@@ -71,7 +71,7 @@ def difference(environment: PaperEnvironment, tuned: Sequence[Result], results: 
 def _repeats(result: Result, environment: PaperEnvironment, algorithm: str) -> bool:
     """Return whether this is the paper's run done here, with as many steps and to the end."""
     row, wanted = result.row, (environment.name, algorithm, "published", environment.steps)
-    return (row.environment, row.algorithm, row.settings, row.steps) == wanted and not result.diverged
+    return (row.environment, row.algorithm, row.settings, row.steps) == wanted and not result.has_diverged
 
 
 def _over_seeds(figures: Sequence[float]) -> float:

@@ -29,7 +29,7 @@ from cirl_marl.errors import CirlError, RunError, unknown_name
 from cirl_marl.evaluation import Comparison, Row, compare, solve_baseline
 from cirl_marl.evaluation.comparison import starting_stocks
 from cirl_marl.evaluation.statistics import Aggregate, over_episodes, over_seeds
-from cirl_marl.jobs import Standing, Tell, raise_first, run_jobs
+from cirl_marl.jobs import JobStatus, Tell, raise_first, run_jobs
 from cirl_marl.learners import RunDirectory, train_seeds
 from cirl_marl.learners.interface import prepare
 from cirl_marl.network import Floats
@@ -191,7 +191,7 @@ def _train(jobs: Sequence[Job], folder: Path, workers: int) -> None:
     with Progress(console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task("training", total=len(jobs))
 
-        def watch(standings: Sequence[Standing]) -> None:
+        def watch(standings: Sequence[JobStatus]) -> None:
             progress.update(task, completed=sum(each.share for each in standings))
 
         raise_first(run_jobs(jobs, folder, on="local", workers=workers, watch=watch))

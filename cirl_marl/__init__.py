@@ -92,9 +92,9 @@ if TYPE_CHECKING:
     from cirl_marl.optimum.planned_episodes import simulate_plan as simulate_plan
     from cirl_marl.reasons.explanation import explain as explain
     from cirl_marl.reasons.inverse import infer as infer
-    from cirl_marl.report.results import draw as draw
-    from cirl_marl.report.results import summarise as summarise
-    from cirl_marl.report.results import write_report as write_report
+    from cirl_marl.report.presentation import draw as draw
+    from cirl_marl.report.presentation import summarise as summarise
+    from cirl_marl.report.presentation import write_report as write_report
     from cirl_marl.sweeps.running import sweep as sweep
     from cirl_marl.testing.conformance import check_parallel_env as check_parallel_env
     from cirl_marl.testing.conformance import check_vector_env as check_vector_env
@@ -138,7 +138,7 @@ _MODULES = {
     "optimum.planned_episodes": "Plan simulate_plan",
     "reasons.explanation": "explain",
     "reasons.inverse": "infer",
-    "report.results": "draw summarise write_report",
+    "report.presentation": "draw summarise write_report",
     "sweeps.running": "sweep",
     "testing.conformance": "check_parallel_env check_vector_env",
     "testing.nested": "ConformanceError",

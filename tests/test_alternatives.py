@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from cirl_marl import CirlError, MultiAgentVectorEnv, cli
 from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
-from cirl_marl.evaluation.quantities import ComparedQuantity, rank_quantities
+from cirl_marl.evaluation.compared_quantities import ComparedQuantity, rank_quantities
 from cirl_marl.evaluation.simulations import Simulation, simulate_alternatives
 from cirl_marl.optimum.registry import named_controller
 from cirl_marl.report import differences as report

@@ -60,7 +60,7 @@ def test_rows_are_recipes_and_controllers(runs: list[Path]) -> None:
     found = compare(runs, ["neutral", "random"], episodes=3, bounds=False)
     trained, neutral, _ = found.rows
     assert [row.name for row in found.rows] == ["independent_a2c", "neutral", "random"]
-    assert (trained.seeds, trained.few, neutral.seeds, neutral.few) == ((0, 1, 2), True, (), False)
+    assert (trained.seeds, trained.has_few_seeds, neutral.seeds, neutral.has_few_seeds) == ((0, 1, 2), True, (), False)
     figure = trained.figure("circularity")
     assert figure is not None
     means = [entry.circularity.mean() for entry in trained.entries]

@@ -107,7 +107,7 @@ def test_import_is_light() -> None:
         f"{PACKAGE}.learners",
         f"{PACKAGE}.learners.run_directory",
         f"{PACKAGE}.learners.recipe",
-        f"{PACKAGE}.paper.selection",
+        f"{PACKAGE}.paper.row_selection",
     ]
     code = (
         "import sys, importlib\n"

@@ -16,7 +16,7 @@ from written_jobs import written
 
 from cirl_marl.definitions.code_permission import code_allowed
 from cirl_marl.errors import CirlError, RunError
-from cirl_marl.jobs import Standing, driver, places, raise_first, run_jobs
+from cirl_marl.jobs import JobStatus, driver, places, raise_first, run_jobs
 from cirl_marl.jobs.work import JobFiles
 
 TESTS = Path(__file__).parent
@@ -31,7 +31,7 @@ def test_jobs_are_done_once(tmp_path: Path) -> None:
     """What is there is left alone, what is missing is done, in order, and who watches sees the end of it."""
     jobs = written(tmp_path)
     jobs[1].file.write_text("0")
-    seen: list[Sequence[Standing]] = []
+    seen: list[Sequence[JobStatus]] = []
     assert run_jobs(jobs, tmp_path / "jobs", watch=seen.append) == []
     assert [job.file.read_text() for job in jobs] == ["1", "0", "1"]
     assert [(each.name, each.state, each.share) for each in seen[-1]] == [(name, "done", 1.0) for name in "abc"]
@@ -62,8 +62,8 @@ def test_what_is_claimed_is_waited_for(tmp_path: Path) -> None:
     lock.acquire()
     seen: list[dict[str, str]] = []
 
-    def watch(standings: Sequence[Standing]) -> None:
-        seen.append({each.name: each.state for each in standings})
+    def watch(statuses: Sequence[JobStatus]) -> None:
+        seen.append({each.name: each.state for each in statuses})
         if seen[-1]["c"] == "done" and lock.is_locked:
             assert not jobs[0].is_done()
             lock.release()
@@ -89,8 +89,8 @@ def test_nobody_is_sent_for_what_is_claimed(tmp_path: Path, monkeypatch: pytest.
         def close(self) -> None:
             pass
 
-    def watch(standings: Sequence[Standing]) -> None:
-        if standings[0].state == "elsewhere" and lock.is_locked:
+    def watch(statuses: Sequence[JobStatus]) -> None:
+        if statuses[0].state == "elsewhere" and lock.is_locked:
             jobs[0].file.write_text("by another")
             lock.release()
 

@@ -25,11 +25,11 @@ from cirl_marl import CirlError, RecipeError, cli
 from cirl_marl.errors import RunError
 from cirl_marl.learners import Recipe, Training, load_recipe, train
 from cirl_marl.learners.algorithms import build
-from cirl_marl.paper import published, running, training
-from cirl_marl.paper.published import ALGORITHMS, ENVIRONMENTS, PaperEnvironment, Published
-from cirl_marl.paper.results import Evaluation, PaperRow, Result, Results, thin_out
-from cirl_marl.paper.running import evaluate, reason_to_repeat, run_row
-from cirl_marl.paper.selection import select_rows
+from cirl_marl.paper import published, rows, training
+from cirl_marl.paper.published import ALGORITHMS, ENVIRONMENTS, PaperEnvironment, PublishedRun
+from cirl_marl.paper.results import EvaluationFigures, PaperRow, Result, Results, thin_out
+from cirl_marl.paper.row_selection import select_rows
+from cirl_marl.paper.rows import evaluate, reason_to_repeat, run_row
 from cirl_marl.paper.table import above_optimum, table_rows
 from cirl_marl.paper.training import TrainingRecord, describe, train_tuned
 
@@ -72,7 +72,9 @@ class Toy(gymnasium.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
 @pytest.fixture
 def toy(monkeypatch: pytest.MonkeyPatch) -> Iterator[PaperEnvironment]:
     """Put a goal task among the environments of the paper."""
-    found = PaperEnvironment(name="Toy", steps=1000, runs={"SAC-HER": Published(end_return=-1.0)}, success_episodes=7)
+    found = PaperEnvironment(
+        name="Toy", steps=1000, runs={"SAC-HER": PublishedRun(end_return=-1.0)}, success_episodes=7
+    )
     gymnasium.register(found.id, entry_point=lambda **_: Toy())
     monkeypatch.setattr(published, "ENVIRONMENTS", {"Toy": found})
     yield found
@@ -89,7 +91,7 @@ def result(algorithm: str = "A2C", steps: int = 200_000, seed: int = 0, end: flo
         start_return=-1.5e8,
         end_return=end,
         curve=[(50, -1.5e8)],
-        evaluation=Evaluation(episodes=100, mean=-4.9e7, deviation=0.0, success=None),
+        evaluation=EvaluationFigures(episodes=100, mean=-4.9e7, deviation=0.0, success=None),
         settings={},
         versions={"torch": "2.13.0"},
         machine={"cpus": 2, "torch_threads": 1},
@@ -146,7 +148,7 @@ def test_row_is_trained_kept_and_not_run_again(
     assert kept["end_return"] == pytest.approx(returns[-half:].mean())
     assert (returns < 0).all()
 
-    monkeypatch.setattr(running, "run_row", lambda *_, **__: pytest.fail("the row was run again"))
+    monkeypatch.setattr(rows, "run_row", lambda *_, **__: pytest.fail("the row was run again"))
     assert cirl(monkeypatch, *arguments) == 0
     assert capsys.readouterr().out.partition("\n") == (f"rows: 1, done: 1; results in {tmp_path}", "\n", shown)
 
@@ -176,8 +178,8 @@ def test_weights_that_become_nan_are_a_result(
     arguments = (algorithm, "--steps", "10000", "--out", str(tmp_path))
     assert cirl(monkeypatch, *arguments) == 0
     assert "weights NaN after" in capsys.readouterr().out
-    (found,) = Results(tmp_path).all()
-    assert found.diverged
+    (found,) = Results(tmp_path).read_all()
+    assert found.has_diverged
     assert found.evaluation is None
     assert 100 < found.steps_done < 10_000
     assert found.episodes == found.steps_done // 50
@@ -206,11 +208,11 @@ def test_a_session_goes_on_after_a_row_that_fails(
             raise CirlError("no training episode ended")
         return replace(result(row.algorithm), row=row)
 
-    monkeypatch.setattr(running, "run_row", run)
+    monkeypatch.setattr(rows, "run_row", run)
     assert cirl(monkeypatch, "--steps", "200", "--out", str(tmp_path)) == 1
     shown = capsys.readouterr().out
     assert "CopperNet A2C (published, 200 steps, seed 0): failed: no training episode ended" in shown
-    assert [each.row.algorithm for each in Results(tmp_path).all()] == ["ARS", "DDPG", "PPO", "SAC"]
+    assert [each.row.algorithm for each in Results(tmp_path).read_all()] == ["ARS", "DDPG", "PPO", "SAC"]
     assert cirl(monkeypatch, "PPO", "--steps", "400", "--out", str(tmp_path)) == 0
     assert "400 of 200,000" in capsys.readouterr().out
     assert cirl(monkeypatch, "PPO", "--steps", "200", "--out", str(tmp_path)) == 0
@@ -247,10 +249,10 @@ def test_interrupted_row_leaves_nothing(
     def interrupted(*_: Any, **__: Any) -> Result:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(running, "run_row", interrupted)
+    monkeypatch.setattr(rows, "run_row", interrupted)
     assert cirl(monkeypatch, "A2C", "--seeds", "2", "--out", str(tmp_path)) == 130
     assert "The same command goes on" in capsys.readouterr().out
-    assert results.all() == [result()]
+    assert results.read_all() == [result()]
 
 
 def test_result_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -260,12 +262,12 @@ def test_result_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pyte
         broken.setattr("os.fsync", lambda _: (_ for _ in ()).throw(OSError("disk")))
         results.write(result())
     assert not results.has(result().row)
-    assert results.all() == []
+    assert results.read_all() == []
     results.write(result())
     assert results.read(result().row) == result()
     results.file(result().row).write_text('{"row": 1}')
     with pytest.raises(RunError, match="is not the result of a row"):
-        results.all()
+        results.read_all()
 
 
 def test_gain_and_gain_per_step() -> None:
@@ -312,7 +314,7 @@ def test_summary_says_what_was_reached() -> None:
     def line(
         name: str, algorithm: str, end: float, final: list[float], success: float | None = None, there: float = -2e6
     ) -> list[str]:
-        ends = Evaluation(episodes=100, mean=there, deviation=0.1, success=None)
+        ends = EvaluationFigures(episodes=100, mean=there, deviation=0.1, success=None)
         environment = ENVIRONMENTS[name]
         made = result(algorithm)
         runs = [
@@ -322,7 +324,7 @@ def test_summary_says_what_was_reached() -> None:
                     environment=name, algorithm=algorithm, settings="tuned", steps=environment.steps, seed=seed
                 ),
                 end_return=end,
-                evaluation=Evaluation(episodes=100, mean=mean, deviation=0.1, success=success),
+                evaluation=EvaluationFigures(episodes=100, mean=mean, deviation=0.1, success=success),
                 published_ends=ends,
             )
             for seed, mean in enumerate(final)
@@ -364,7 +366,7 @@ def test_differences_are_held_against_their_error(
 
     def reacher(end: float, seed: int, algorithm: str, settings: str) -> Result:
         row = PaperRow(environment="Reacher", algorithm=algorithm, settings=settings, steps=100_000, seed=seed)
-        played = Evaluation(episodes=10_000, mean=-4.0, deviation=one, success=95.0)
+        played = EvaluationFigures(episodes=10_000, mean=-4.0, deviation=one, success=95.0)
         return result(end=end, row=row, evaluation=played)
 
     tuned = [reacher(end, seed, "SAC", "tuned") for seed, end in enumerate(ends)]
@@ -379,7 +381,7 @@ def test_differences_are_held_against_their_error(
 
 def test_what_the_kept_rows_say_is_better() -> None:
     """As the prose beside the table says."""
-    kept = Results(KEPT).all()
+    kept = Results(KEPT).read_all()
     found = {}
     for name, environment in ENVIRONMENTS.items():
         tuned = [each for each in kept if (each.row.environment, each.row.settings) == (name, "tuned")]
@@ -391,7 +393,7 @@ def test_what_the_kept_rows_say_is_better() -> None:
 
 def test_figures_above_the_optimum_are_chance() -> None:
     """They are said to be so in the rows that have them, and lie within three standard errors of it."""
-    kept = Results(KEPT).all()
+    kept = Results(KEPT).read_all()
     marked = 0
     for environment in ENVIRONMENTS.values():
         mine = [each for each in kept if each.row.environment == environment.name]
@@ -476,7 +478,7 @@ def test_results_that_answer_another_question_are_outdated() -> None:
 @pytest.mark.medium
 def test_every_kept_row_is_of_the_definitions_of_today() -> None:
     """Those on record are those of today, as all are but in 16 early rows, and the document shows all rows."""
-    kept = Results(KEPT).all()
+    kept = Results(KEPT).read_all()
     assert len(kept) > 80
     assert sum("definition_sha256" not in result.settings for result in kept) == 16
     assert [(str(result.row), why) for result in kept if (why := reason_to_repeat(result))] == []
@@ -488,7 +490,7 @@ def test_results_need_a_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A path that cannot be one is refused before anything is trained."""
-    monkeypatch.setattr(running, "run_row", lambda *_, **__: pytest.fail("a row was run"))
+    monkeypatch.setattr(rows, "run_row", lambda *_, **__: pytest.fail("a row was run"))
     (tmp_path / "file").touch()
     assert cirl(monkeypatch, "A2C", "--out", str(tmp_path / "file")) == 2
     assert f"{tmp_path / 'file'}: results need a directory" in capsys.readouterr().err
@@ -499,7 +501,7 @@ def test_goal_task_learns_with_hindsight(toy: PaperEnvironment) -> None:
     """Successes count when they come, in the number of episodes asked for."""
     del toy
     found = run_row(PaperRow(environment="Toy", algorithm="SAC-HER", steps=110), episodes=40)
-    assert found.evaluation == Evaluation(episodes=40, mean=-10.0, deviation=0.0, success=50.0)
+    assert found.evaluation == EvaluationFigures(episodes=40, mean=-10.0, deviation=0.0, success=50.0)
     assert found.end_return == -10.0
     assert found.settings["policy"] == "MultiInputPolicy"
 
@@ -586,8 +588,8 @@ def test_first_and_last_episodes_do_not_overlap(episodes: int, window: int, monk
         settings={},
         options={},
     )
-    monkeypatch.setattr(running, "train_published", lambda *_: done)
-    monkeypatch.setattr(running, "EVALUATION_EPISODES", 20)
+    monkeypatch.setattr(rows, "train_published", lambda *_: done)
+    monkeypatch.setattr(rows, "EVALUATION_EPISODES", 20)
     found = run_row(PaperRow(environment="CopperNet", algorithm="A2C", steps=50 * episodes))
     assert found.start_return == pytest.approx(np.mean(returns[:window]))
     assert found.end_return == pytest.approx(np.mean(returns[-window:]))

@@ -20,7 +20,7 @@ from cirl_marl.controllers.rollout import EVALUATION_SEEDS, SEED_SPACING, rollou
 from cirl_marl.network import Floats
 from cirl_marl.paper.published import ENVIRONMENTS
 from cirl_marl.paper.results import Result, Results
-from cirl_marl.paper.running import EVALUATION_COPIES, EVALUATION_EPISODES, evaluate
+from cirl_marl.paper.rows import EVALUATION_COPIES, EVALUATION_EPISODES, evaluate
 
 KEPT = Path(__file__).parent.parent / "benchmarks" / "results" / "paper"
 NETWORKS = {"CarboNet": "carbo_net", "CopperNet": "copper_net"}
@@ -164,4 +164,4 @@ def tuned(name: str) -> list[Result]:
 
 def kept(name: str) -> list[Result]:
     """Return the rows of the tables for one environment."""
-    return [result for result in Results(KEPT).all() if result.row.environment == name]
+    return [result for result in Results(KEPT).read_all() if result.row.environment == name]

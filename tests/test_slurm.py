@@ -15,7 +15,7 @@ import pytest
 from written_jobs import Exploding, written
 
 from cirl_marl.errors import CirlError, RunError
-from cirl_marl.jobs import Standing, run_jobs, slurm
+from cirl_marl.jobs import JobStatus, run_jobs, slurm
 from cirl_marl.jobs.slurm import Queue, sbatch_options
 from cirl_marl.jobs.work import JobFiles
 
@@ -222,7 +222,7 @@ def test_a_cancelled_job_is_noticed(node: str, tmp_path: Path) -> None:
     """Whoever takes it out of the queue ends it for the driver, too, with and without accounting."""
     begun = tmp_path / "a.begun"
 
-    def watch(standings: Sequence[Standing]) -> None:
+    def watch(statuses: Sequence[JobStatus]) -> None:
         if begun.is_file():
             subprocess.run(["scancel", "--me"], check=True)
 

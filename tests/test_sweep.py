@@ -25,7 +25,7 @@ from cirl_marl.errors import CirlError, DefinitionError, RunError
 from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.pareto import pareto_front
 from cirl_marl.evaluation.statistics import over_episodes
-from cirl_marl.jobs import Standing
+from cirl_marl.jobs import JobStatus
 from cirl_marl.learners import train
 from cirl_marl.network import Network
 from cirl_marl.sweeps import Cell, CellStatus, load_sweep, sweep
@@ -172,7 +172,7 @@ def test_a_cell_is_a_training_and_its_evaluation(asked: Path) -> None:
     changed(changed(asked, "seeds = [0, 1]", "seeds = 1"), "[0.2, 0.8]", "0.2")
     changed(asked, "bounds = false", "bounds = true")
     seen: list[CellStatus] = []
-    found = sweep(asked, on="here", watch=lambda standings: seen.extend(standings))
+    found = sweep(asked, on="here", watch=lambda statuses: seen.extend(statuses))
     (row,) = found.rows
     run = found.folder / "cells" / row["cell"] / "run"
     train("bottles.toml", "quick.toml", directory="alone", seed=1, circularity_weight=0.2)
@@ -184,7 +184,7 @@ def test_a_cell_is_a_training_and_its_evaluation(asked: Path) -> None:
     assert row["circularity"] == pytest.approx(entry.circularity.mean())
     assert row["service"] == pytest.approx(entry.service.mean())
     assert (row["unit"], row["circularity_weight"], row["steps"], row["no_bound"]) == ("t", 0.2, 160, None)
-    assert seen[-1].standing.state == "done" and seen[-1].gap == pytest.approx(gap.value)
+    assert seen[-1].job_status.state == "done" and seen[-1].gap == pytest.approx(gap.value)
     with (found.folder / "sweep.csv").open(newline="") as file:
         (kept,) = csv.DictReader(file)
     assert kept == {key: "" if value is None else str(value) for key, value in row.items()}
@@ -310,15 +310,15 @@ def test_the_live_table_says_who_is_how_far(asked: Path) -> None:
 
     cell = cells_of(load_sweep(asked))[0]
     training = {"what": "training", "done": 80, "total": 160}
-    standings = [
-        standing(cell, "first", "waiting", {}, None),
-        standing(cell, "second", "done", {"what": "done"}, 0.25),
-        standing(cell, "third", "elsewhere", {"what": "evaluating", "done": 0.5}, 0.3),
-        standing(cell, "fourth", "running", training, 0.5),
+    statuses = [
+        cell_status(cell, "first", "waiting", {}, None),
+        cell_status(cell, "second", "done", {"what": "done"}, 0.25),
+        cell_status(cell, "third", "elsewhere", {"what": "evaluating", "done": 0.5}, 0.3),
+        cell_status(cell, "fourth", "running", training, 0.5),
     ]
     printer = Console(width=100)
     with printer.capture() as shown:
-        printer.print(table_of(standings))
+        printer.print(table_of(statuses))
     title, *lines = [line.strip() for line in shown.get().splitlines()]
     assert title == "1 running, 1 elsewhere, 1 waiting, 1 done"
     rows = [[part.strip() for part in line.strip("│").split("│")] for line in lines if line.startswith("│")]
@@ -328,9 +328,9 @@ def test_the_live_table_says_who_is_how_far(asked: Path) -> None:
         ["first", "waiting", "", ""],
         ["second", "done", "160 of 160", "25.0%"],
     ]
-    assert table_of(standings[:1] * (ROWS + 1)).row_count == ROWS + 1
-    assert [share_done(each) for each in standings] == [0.0, 1.0, 1.0, 0.5]
-    assert str(table_of(standings, 90.2).title).endswith("; about 0:01:30 left")
+    assert table_of(statuses[:1] * (ROWS + 1)).row_count == ROWS + 1
+    assert [share_done(each) for each in statuses] == [0.0, 1.0, 1.0, 0.5]
+    assert str(table_of(statuses, 90.2).title).endswith("; about 0:01:30 left")
 
 
 def test_the_example_is_the_one_of_the_guide() -> None:
@@ -343,9 +343,9 @@ def test_the_example_is_the_one_of_the_guide() -> None:
     assert (asked.networks, asked.seeds, asked.options.circularity_weight) == (["copper_net"], [0, 1], [0.5, 0.9])
 
 
-def standing(cell: Cell, name: str, state: Any, figures: dict[str, Any], gap: float | None) -> CellStatus:
+def cell_status(cell: Cell, name: str, state: Any, figures: dict[str, Any], gap: float | None) -> CellStatus:
     """Return how far a cell is."""
-    return CellStatus(cell, Standing(name, state, figures), gap)
+    return CellStatus(cell, JobStatus(name, state, figures), gap)
 
 
 def outcome(folder: Path) -> dict[str, Any]:

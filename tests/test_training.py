@@ -26,7 +26,7 @@ from cirl_marl.learners.recipe import LearnerSettings, Match, Run
 from cirl_marl.learners.views import OneAgent
 from cirl_marl.network.elements import Episode, Law
 from cirl_marl.paper.results import PaperRow
-from cirl_marl.paper.running import run_row
+from cirl_marl.paper.rows import run_row
 
 pytestmark = pytest.mark.medium
 

@@ -153,7 +153,7 @@ def _write_one(folder: Path, files: Mapping[str, Simulation]) -> None:
 
 def _write_several(folder: Path, files: Mapping[str, Simulation]) -> None:
     """Write and say what became of alternatives, and what differs between them."""
-    from cirl_marl.evaluation.quantities import rank_quantities
+    from cirl_marl.evaluation.compared_quantities import rank_quantities
     from cirl_marl.report.differences import ROWS, differences_table, write_alternatives
 
     simulations = list(files.values())

@@ -27,7 +27,7 @@ from cirl_marl.cli.common import (
     training_bar,
 )
 from cirl_marl.errors import CirlError
-from cirl_marl.jobs import PLACES, Standing, run_jobs
+from cirl_marl.jobs import PLACES, JobStatus, run_jobs
 
 EVALUATION_SHARE = 0.6
 """Share of the evaluation in the work on a page; the rest is to plan."""
@@ -183,8 +183,8 @@ def paper(
     """Repeat the CiRL paper's training runs, half a day in all, and show their figures beside the published ones."""
     from cirl_marl.paper.published import ENVIRONMENTS
     from cirl_marl.paper.results import Results
-    from cirl_marl.paper.running import reason_to_repeat
-    from cirl_marl.paper.selection import overview, select_rows
+    from cirl_marl.paper.row_selection import overview, select_rows
+    from cirl_marl.paper.rows import reason_to_repeat
     from cirl_marl.paper.table import environment_table, result_line
     from cirl_marl.paper.training import check_registered
 
@@ -206,7 +206,7 @@ def paper(
     except KeyboardInterrupt:
         say(f"\nstopped; finished rows are kept in {out}. The same command goes on.")
         raise typer.Exit(130) from None
-    results_on_disk, requests = results.all(), {_request(row) for row in rows}
+    results_on_disk, requests = results.read_all(), {_request(row) for row in rows}
     for environment_data in environments:
         fit = [result for result in results_on_disk if result.row in rows or _request(result.row) not in requests]
         console.print(environment_table(environment_data, fit))
@@ -220,15 +220,15 @@ def _request(row: PaperRow) -> tuple[str, str, str]:
 
 def _run_rows(rows: Sequence[PaperRow], results: Results, episodes: int | None, on: str, workers: int | None) -> bool:
     """Train and evaluate rows of the paper's tables, keep the results, and return whether any has failed."""
-    from cirl_marl.paper.running import RowJob
+    from cirl_marl.paper.rows import RowJob
     from cirl_marl.paper.table import result_line
 
     jobs = {row.stem: RowJob(row, results.path, episodes) for row in rows}
     names_shown: set[str] = set()
     with shares() as progress:
 
-        def watch(standings: Sequence[Standing]) -> None:
-            for status in standings:
+        def watch(statuses: Sequence[JobStatus]) -> None:
+            for status in statuses:
                 if status.state == "done" and status.name not in names_shown:
                     names_shown.add(status.name)
                     say(result_line(results.read(jobs[status.name].row)))

@@ -52,8 +52,11 @@ def new(
     mass: Annotated[str, typer.Option(prompt="Unit of mass (such as t, kt, Mt)", help="Unit of mass.")],
     in_use: Annotated[float, typer.Option(prompt="How much of it is in use", help="Mass in use at the start.")],
     lifetime: Annotated[float, typer.Option(prompt="How many years it stays in use", help="Mean lifetime in years.")],
-    recycled: Annotated[
-        float, typer.Option(prompt="Share of discards that is recycled today (0 to 1)", help="Share that is recycled.")
+    recycled_share: Annotated[
+        float,
+        typer.Option(
+            "--recycled", prompt="Share of discards that is recycled today (0 to 1)", help="Share that is recycled."
+        ),
     ],
     growth: Annotated[float, typer.Option(help="Growth of what is in use, percent a year.")] = 0.0,
     start: Annotated[int, typer.Option(help="First year.")] = 2025,
@@ -65,7 +68,7 @@ def new(
     """
     from cirl_marl.definitions.template import FirstCycle, write_first
 
-    answers = {"material": material, "mass": mass, "in_use": in_use, "lifetime": lifetime, "recycled": recycled}
+    answers = {"material": material, "mass": mass, "in_use": in_use, "lifetime": lifetime, "recycled": recycled_share}
     write_first(FirstCycle(**answers, growth=growth, start=start, years=years), file)  # type: ignore[arg-type]
     say(f"wrote {file}; next: cirl plan {file} --control optimum --min-service 1, and cirl train {file}")
 

@@ -110,20 +110,20 @@ def _live(on_stderr: bool) -> Iterator[Callable[[Sequence[CellStatus]], None]]:
     if printer.is_terminal:
         first: list[tuple[float, float]] = []
 
-        def update(standings: Sequence[CellStatus]) -> None:
-            now = clock.monotonic(), sum(map(share_done, standings)) / len(standings)
+        def update(statuses: Sequence[CellStatus]) -> None:
+            now = clock.monotonic(), sum(map(share_done, statuses)) / len(statuses)
             if not first:
                 first.append(now)
-            live.update(table_of(standings, time_left(first[0], now)), refresh=True)
+            live.update(table_of(statuses, time_left(first[0], now)), refresh=True)
 
         with Live(console=printer, transient=True, auto_refresh=False) as live:
             yield update
         return
     before: dict[str, str] = {}
 
-    def tell(standings: Sequence[CellStatus]) -> None:
-        for cell in standings:
-            name, state = cell.standing.name, cell.standing.state
+    def tell(statuses: Sequence[CellStatus]) -> None:
+        for cell in statuses:
+            name, state = cell.job_status.name, cell.job_status.state
             if before.setdefault(name, "waiting") != state:
                 before[name] = state
                 line = f"{state}: {name}" + (
@@ -136,10 +136,10 @@ def _live(on_stderr: bool) -> Iterator[Callable[[Sequence[CellStatus]], None]]:
 
 def share_done(cell: CellStatus) -> float:
     """Return the share of a cell's training that is done; what follows on it is short."""
-    activity = str(cell.standing.figures.get("what", ""))
-    if cell.standing.state == "done" or activity.startswith("evaluat"):
+    activity = str(cell.job_status.figures.get("what", ""))
+    if cell.job_status.state == "done" or activity.startswith("evaluat"):
         return 1.0
-    return cell.standing.share if activity == "training" else 0.0
+    return cell.job_status.share if activity == "training" else 0.0
 
 
 def time_left(first: tuple[float, float], now: tuple[float, float]) -> float | None:
@@ -154,31 +154,31 @@ def time_left(first: tuple[float, float], now: tuple[float, float]) -> float | N
     return (now[0] - first[0]) * (1.0 - now[1]) / done if done > 0 else None
 
 
-def table_of(standings: Sequence[CellStatus], seconds_to_go: float | None = None) -> Table:
+def table_of(statuses: Sequence[CellStatus], seconds_to_go: float | None = None) -> Table:
     """Draw who is how far, and about how many seconds are left."""
-    counts = {state: sum(cell.standing.state == state for cell in standings) for state in ORDER}
+    counts = {state: sum(cell.job_status.state == state for cell in statuses) for state in ORDER}
     title = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
     if seconds_to_go:
         title += f"; about {timedelta(seconds=round(seconds_to_go))} left"
     table = Table("cell", "state", "steps", "gap to the bound", title=title)
-    rows = sorted(standings, key=lambda cell: ORDER.index(cell.standing.state))
+    rows = sorted(statuses, key=lambda cell: ORDER.index(cell.job_status.state))
     for cell in rows[:ROWS]:
-        about = "" if cell.standing.state == "done" else "~"
+        about = "" if cell.job_status.state == "done" else "~"
         gap = "" if cell.gap is None else f"{about}{cell.gap:.1%}"
-        table.add_row(cell.standing.name, _activity(cell), _steps(cell), gap)
+        table.add_row(cell.job_status.name, _activity(cell), _steps(cell), gap)
     if len(rows) > ROWS:
         table.add_row(f"… and {len(rows) - ROWS} more", "", "", "")
     return table
 
 
 def _activity(cell: CellStatus) -> str:
-    activity = cell.standing.figures.get("what", "") if cell.standing.state in ("running", "elsewhere") else ""
-    return f"{cell.standing.state} {activity}".strip()
+    activity = cell.job_status.figures.get("what", "") if cell.job_status.state in ("running", "elsewhere") else ""
+    return f"{cell.job_status.state} {activity}".strip()
 
 
 def _steps(cell_status: CellStatus) -> str:
-    figures, steps = cell_status.standing.figures, f"{cell_status.cell.steps:,}"
-    if cell_status.standing.state == "done" or figures.get("what", "").startswith("evaluat"):
+    figures, steps = cell_status.job_status.figures, f"{cell_status.cell.steps:,}"
+    if cell_status.job_status.state == "done" or figures.get("what", "").startswith("evaluat"):
         return f"{steps} of {steps}"
     return f"{figures['done']:,} of {steps}" if figures.get("what") == "training" else ""
 

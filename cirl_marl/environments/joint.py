@@ -23,10 +23,10 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, ControlError, unknown_name
 from cirl_marl.network import Floats, Network
 
-Observation = NDArray[np.float32]
+JointObservation = NDArray[np.float32]
 
 
-class JointEnv(gymnasium.Env[Observation, Observation]):
+class JointEnv(gymnasium.Env[JointObservation, JointObservation]):
     """One copy of a network in which one learner acts for all agents.
 
     ``info`` has the keys of ``MultiAgentVectorEnv.team_info``, as numbers of this copy; in the last step of an episode
@@ -53,13 +53,13 @@ class JointEnv(gymnasium.Env[Observation, Observation]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
+    ) -> tuple[JointObservation, dict[str, Any]]:
         """Start an episode; options are those of ``MultiAgentVectorEnv.reset``."""
         observations, infos = self.parallel.reset(seed=seed, options=options)
         super().reset(seed=seed)
         return np.concatenate([*observations.values()]), infos[self.parallel.agents[0]]
 
-    def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[JointObservation, float, bool, bool, dict[str, Any]]:
         """Hold the actions of all agents, one after the other in [−1, 1], for one control interval.
 
         Raises:
@@ -81,7 +81,7 @@ class JointEnv(gymnasium.Env[Observation, Observation]):
         self.parallel.close()
 
 
-class JointVectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArray[Any]]):
+class JointVectorEnv(gymnasium.vector.VectorEnv[JointObservation, JointObservation, NDArray[Any]]):
     """``num_envs`` copies of a network, stepped as one batch, in each of which one learner acts for all agents.
 
     Every episode ends at the horizon, so that all copies end at once. When they do, ``metadata["autoreset_mode"]`` says
@@ -129,7 +129,7 @@ class JointVectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArra
 
     def reset(  # a seed for each copy, too
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
+    ) -> tuple[JointObservation, dict[str, Any]]:
         """Start an episode in every copy; arguments are those of ``MultiAgentVectorEnv.reset``."""
         observations = self.batch.reset(seed, options)
         super().reset(seed=int(seed) if isinstance(seed, int | np.integer) else None)
@@ -137,7 +137,9 @@ class JointVectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArra
         infos = {} if factors is None else {"drawn": factors.T}
         return np.ascontiguousarray(np.concatenate([*observations.values()], axis=1)), infos
 
-    def step(self, actions: ArrayLike) -> tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+    def step(
+        self, actions: ArrayLike
+    ) -> tuple[JointObservation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Hold the actions of all agents, shape (num_envs, their entries) in [−1, 1], for one control interval.
 
         Raises:

@@ -82,7 +82,7 @@ def evaluate(
     episodes: int = 64,
     seed: int = 0,
     bounds: bool = True,
-    progress: Callable[[str, float], None] = lambda what, share: None,
+    progress: Callable[[str, float], None] = lambda stage, share: None,
 ) -> Evaluation:
     """Compare the trained policies of a run with neutral and random control on fresh episodes.
 

@@ -79,7 +79,7 @@ class Row:
         return tuple(entry.seed for entry in self.entries if entry.seed is not None)
 
     @property
-    def few(self) -> bool:
+    def has_few_seeds(self) -> bool:
         """Whether there are fewer training seeds than an interval over them should rest on."""
         return 0 < len(self.seeds) < ENOUGH_SEEDS
 
@@ -131,7 +131,7 @@ def compare(
     min_service: ArrayLike | None = None,
     bounds: bool = True,
     uncertain: bool | None = None,
-    progress: ProgressReport = lambda what, share: None,
+    progress: ProgressReport = lambda stage, share: None,
 ) -> Comparison:
     """Let trained policies and controllers act in the same fresh episodes.
 

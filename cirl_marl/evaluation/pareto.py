@@ -16,7 +16,7 @@ from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.baselines import FRONT
 from cirl_marl.evaluation.comparison import ProgressReport, part_of
 from cirl_marl.evaluation.contenders import differences
-from cirl_marl.jobs import Standing, Tell, check_place, raise_first, run_jobs
+from cirl_marl.jobs import JobStatus, Tell, check_place, raise_first, run_jobs
 from cirl_marl.learners import Recipe, RunDirectory, load_recipe
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum import Bound, Envelope, NoCertificate, bound, improve_plan, simulate_plan
@@ -130,9 +130,9 @@ def pareto_front(
     if recipe_ is None:
         return ParetoFront(definition, None, possible, front=front)
 
-    def watch(standings: Sequence[Standing]) -> None:
-        busy = [job.name for job in standings if job.state == "running"]
-        done = sum(job.share for job in standings) / len(standings)
+    def watch(statuses: Sequence[JobStatus]) -> None:
+        busy = [job.name for job in statuses if job.state == "running"]
+        done = sum(job.share for job in statuses) / len(statuses)
         progress(f"training {', '.join(busy)}", share + (1 - share) * done)
 
     raise_first(run_jobs(jobs, directory / "runs" / "jobs", on=on, workers=workers, watch=watch))

@@ -41,7 +41,7 @@ class Failure:
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class JobStatus:
     """How far a job is.
 
     Attributes:
@@ -59,7 +59,7 @@ class Standing:
         return 1.0 if self.state == "done" else float(self.figures.get("done", 0)) / float(self.figures.get("total", 1))
 
 
-Watch = Callable[[Sequence[Standing]], None]
+Watch = Callable[[Sequence[JobStatus]], None]
 
 
 def run_jobs(
@@ -69,7 +69,7 @@ def run_jobs(
     on: str = "here",
     workers: int | None = None,
     settings: Mapping[str, str] | None = None,
-    watch: Watch = lambda standings: None,
+    watch: Watch = lambda statuses: None,
     say: Callable[[str], None] = lambda line: None,
 ) -> list[Failure]:
     """Do every job that is not done. One that fails, or whose worker dies, keeps no other from being done.
@@ -83,7 +83,7 @@ def run_jobs(
         on: ``here`` (one after the other in this process), ``local``, ``slurm`` or ``ray``.
         workers: how many work at a time; None is all that the place has.
         settings: of ``sbatch``, for ``slurm``.
-        watch: called with the standing of every job, about once a second.
+        watch: called with the status of every job, about once a second.
         say: called with where the jobs are done.
 
     Returns:
@@ -220,4 +220,4 @@ class _Driver:
         for name, state in self._states.items():
             if state in ("running", "elsewhere") or name not in self._last_report:
                 self._last_report[name] = self._files[name].figures()
-        self._watch([Standing(name, state, self._last_report[name]) for name, state in self._states.items()])
+        self._watch([JobStatus(name, state, self._last_report[name]) for name, state in self._states.items()])

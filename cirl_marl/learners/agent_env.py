@@ -18,7 +18,7 @@ from cirl_marl.network import Floats
 from cirl_marl.network.elements import Compartment
 
 
-class JointEnv(Protocol):
+class BatchedEnv(Protocol):
     """Several copies of an environment of many agents, all stepped at once; ``MultiAgentVectorEnv`` is one.
 
     What it takes and gives is by agent, with a leading axis of ``num_envs`` entries. An episode that has ended is
@@ -144,7 +144,7 @@ class AgentVecEnv(VecEnv):
 
     def __init__(
         self,
-        env: JointEnv,
+        env: BatchedEnv,
         name: str,
         view: View,
         wait: Callable[[], object],

@@ -29,7 +29,7 @@ from stable_baselines3.common.utils import set_random_seed
 from cirl_marl.environments.state import Snapshot, State
 from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, ControlError, LearnerError
-from cirl_marl.learners.agent_env import AgentVecEnv, JointEnv, JointStep
+from cirl_marl.learners.agent_env import AgentVecEnv, BatchedEnv, JointStep
 from cirl_marl.learners.barrier import CheckpointBarrier
 from cirl_marl.learners.views import OneAgent, View
 
@@ -153,7 +153,7 @@ class World:
     """
 
     def __init__(
-        self, env: JointEnv, seeds: Sequence[int], agent_envs: Mapping[str, AgentVecEnv], *, done: int = 0
+        self, env: BatchedEnv, seeds: Sequence[int], agent_envs: Mapping[str, AgentVecEnv], *, done: int = 0
     ) -> None:
         """Reset ``env`` with one of ``seeds`` per copy for ``agent_envs``, after ``done`` joint steps before.
 

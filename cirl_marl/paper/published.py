@@ -23,7 +23,7 @@ ALGORITHMS = BOX_ALGORITHMS + GOAL_ALGORITHMS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Published:
+class PublishedRun:
     """One run of the paper; None where its figure is not known.
 
     Attributes:
@@ -65,7 +65,7 @@ class PaperEnvironment:
 
     name: str
     steps: int
-    runs: Mapping[str, Published]
+    runs: Mapping[str, PublishedRun]
     optima: tuple[BestKnown, ...] = ()
     success_episodes: int = 0
     published_ends: bool = False

@@ -48,7 +48,7 @@ class PaperRow:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Evaluation:
+class EvaluationFigures:
     """The final policy, deterministic, on fresh episodes: mean and standard deviation of their returns.
 
     ``success`` is the share with a success at any step, percent; None if the environment knows no success.
@@ -89,13 +89,13 @@ class Result:
     start_return: float
     end_return: float
     curve: list[tuple[int, float]]
-    evaluation: Evaluation | None
+    evaluation: EvaluationFigures | None
     settings: dict[str, Any]
     versions: dict[str, str]
     machine: dict[str, Any]
     finished: str
     cpu_seconds: float | None = None
-    published_ends: Evaluation | None = None
+    published_ends: EvaluationFigures | None = None
 
     @property
     def gain(self) -> float:
@@ -108,7 +108,7 @@ class Result:
         return max(1, min(WINDOW, self.episodes // 2))
 
     @property
-    def diverged(self) -> bool:
+    def has_diverged(self) -> bool:
         """Whether the weights became NaN, so that the training ended before its time and left no policy."""
         return self.evaluation is None
 
@@ -151,7 +151,7 @@ class Results:
         text = _one_line_each(asdict(result) | figures)
         write_atomically(self.file(result.row), lambda partial: partial.write_text(text))
 
-    def all(self) -> list[Result]:
+    def read_all(self) -> list[Result]:
         """Return every result in the directory, by file name."""
         return [_read(path) for path in sorted(self.path.glob("*.json")) if not path.name.startswith(".")]
 
@@ -181,7 +181,7 @@ def _read(path: Path) -> Result:
 def thin_out(ends: Sequence[int], returns: Sequence[float]) -> list[tuple[int, float]]:
     """Return at most 500 points of a learning curve: means of consecutive episodes, at the step where the last ended.
 
-    >>> thinned([50, 100], [-2.0, -1.0])
+    >>> thin_out([50, 100], [-2.0, -1.0])
     [(50, -2.0), (100, -1.0)]
     """
     parts = np.array_split(np.arange(len(returns)), min(CURVE_POINTS, len(returns)))

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import numpy as np
 from rich.table import Table
 
-from cirl_marl.paper.published import PaperEnvironment, Published
-from cirl_marl.paper.results import WINDOW, Evaluation, Result
+from cirl_marl.paper.published import PaperEnvironment, PublishedRun
+from cirl_marl.paper.results import WINDOW, EvaluationFigures, Result
 
 COLUMNS = ("algorithm", "run", "seeds", "r_s", "r_e", "ζ", "ψ", "s (%)", "final policy", "minutes", "CPU min", "remark")
 NUMERIC = COLUMNS[3:11]
@@ -95,7 +95,7 @@ def _scale(value: float) -> tuple[float, int]:
     return float(mantissa), int(exponent)
 
 
-def _paper_row(environment: PaperEnvironment, algorithm: str, run: Published) -> tuple[str, ...]:
+def _paper_row(environment: PaperEnvironment, algorithm: str, run: PublishedRun) -> tuple[str, ...]:
     gain = None if run.start_return is None or run.end_return is None else run.end_return - run.start_return
     figures = (run.start_return, run.end_return, gain, None if gain is None else gain / environment.steps, run.success)
     minutes = "" if run.minutes is None else f"{run.minutes:.1f}"
@@ -150,7 +150,7 @@ def _remarks(environment: PaperEnvironment, seeds: Sequence[Result]) -> Iterator
         more = f", {result.steps_done:,} done" if result.steps_done > result.row.steps else ""
         yield f"{result.row.steps:,} of {environment.steps:,} steps{more}"
     for seed in seeds:
-        if seed.diverged:
+        if seed.has_diverged:
             yield f"seed {seed.row.seed}: {_broke(seed)}, r_e is of the last episodes before"
     words = result.settings.get("recipe", {}).get("learner", {}).get("demonstrations")
     if words:
@@ -182,7 +182,7 @@ def notes(environment: PaperEnvironment, results: Iterable[Result]) -> str:
     return " ".join([*sentences, f"Optimum: {best}.", environment.remark]).rstrip()
 
 
-def _spread(evaluations: Sequence[Evaluation]) -> str:
+def _spread(evaluations: Sequence[EvaluationFigures]) -> str:
     deviation = float(np.mean([evaluation.deviation for evaluation in evaluations]))
     if deviation < 1e-9 * max(abs(evaluation.mean) for evaluation in evaluations):
         return "they are all alike, as the start is fixed"

@@ -27,7 +27,7 @@ from cirl_marl.learners.learner import derived_seed, wrap_in_normaliser
 from cirl_marl.learners.recipe import LearnerSettings, Normalisation
 from cirl_marl.paper.published import PaperEnvironment
 from cirl_marl.paper.results import PaperRow
-from cirl_marl.paper.selection import tuned_recipe
+from cirl_marl.paper.row_selection import tuned_recipe
 
 Report = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from cirl_marl.controllers.rollout import interval_ends
 from cirl_marl.drawing.style import DASHES, SERIES, axis_time, readable
-from cirl_marl.evaluation.quantities import ComparedQuantity
+from cirl_marl.evaluation.compared_quantities import ComparedQuantity
 from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.evaluation.statistics import finite_or_none
 from cirl_marl.network import Floats

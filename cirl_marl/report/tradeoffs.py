@@ -28,7 +28,7 @@ def comparison_table(comparison: Comparison) -> Table:
     """One row a recipe or controller: λ̄, gain, service level, bound and gap, with 95 % confidence intervals."""
     rows = []
     for row in comparison.rows:
-        seeds = f"{len(row.seeds)} (few)" if row.few else str(len(row.seeds) or "")
+        seeds = f"{len(row.seeds)} (few)" if row.has_few_seeds else str(len(row.seeds) or "")
         figures = zip(FIGURES, FORMS, strict=True)
         rows.append([row.name, seeds, *(_interval(row.figure(name), form) for name, form in figures)])
     headings = ["policy", "seeds", f"λ̄ ({comparison.network.mass_unit})", *_headers(comparison)[1:]]
@@ -44,7 +44,7 @@ def comparison_notes(comparison: Comparison) -> list[str]:
             "trained: interquartile mean over training seeds, bootstrap over seeds; controllers: mean over episodes, "
             "Student's t"
         )
-    if any(row.few for row in comparison.rows):
+    if any(row.has_few_seeds for row in comparison.rows):
         notes.append(f"few: fewer than {ENOUGH_SEEDS} training seeds; the interval says little, one seed has none")
     if comparison.entries[0].bound is not None:
         foresight = "" if baseline.envelope is not None else ", whatever anybody knew of what was drawn,"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cirl_marl.jobs import Failure, Job, Standing, check_place, run_jobs
+from cirl_marl.jobs import Failure, Job, JobStatus, check_place, run_jobs
 from cirl_marl.sweeps.cells import Cell, cells_of
 from cirl_marl.sweeps.folder import SweepFolder, jobs_of
 from cirl_marl.sweeps.fronts import FrontJob
@@ -19,12 +19,12 @@ class CellStatus:
     """How far a cell is.
 
     Attributes:
-        standing: of the work on it.
+        job_status: how far the work on it is.
         gap: to the bound: that of its result, or about that of the best policies so far; None if it is not known.
     """
 
     cell: Cell
-    standing: Standing
+    job_status: JobStatus
     gap: float | None
 
 
@@ -50,7 +50,7 @@ def sweep(
     out: str | Path | None = None,
     settings: Mapping[str, str] | None = None,
     checkpoint_every: float | None = None,
-    watch: Callable[[Sequence[CellStatus]], None] = lambda standings: None,
+    watch: Callable[[Sequence[CellStatus]], None] = lambda statuses: None,
     say: Callable[[str], None] = lambda line: None,
 ) -> SweepOutcome:
     """Train and evaluate all cells of a sweep file that are not done: networks x scenarios x recipes x options x seeds.
@@ -66,7 +66,7 @@ def sweep(
         out: folder of the sweep; None is ``runs/sweep-NAME`` after the name of the file.
         settings: options of ``sbatch``, for ``slurm``.
         checkpoint_every: seconds after which a training is saved; None is a minute.
-        watch: called with the standing of all cells, about once a second.
+        watch: called with the status of all cells, about once a second.
         say: called with where the cells are trained.
 
     Raises:
@@ -83,16 +83,16 @@ def sweep(
     fronts = {cell.name: FrontJob.of(cell, folder.bounds) for cell in cells} if request.evaluation.bounds else {}
     rest = {fronts[name].name: fronts[name] for name, job in work.items() if name in fronts and not job.is_done()}
 
-    def report(standings: Sequence[Standing]) -> None:
-        statuses = {status.name: status for status in standings}
-        watch([_cell_status(work[name].cell, statuses[name], fronts.get(name)) for name in work])
+    def report(statuses: Sequence[JobStatus]) -> None:
+        by_name = {status.name: status for status in statuses}
+        watch([_cell_status(work[name].cell, by_name[name], fronts.get(name)) for name in work])
 
     jobs: list[Job] = [*rest.values(), *work.values()]
     failures = run_jobs(jobs, folder.jobs, on=on, workers=workers, settings=settings, watch=report, say=say)
     return SweepOutcome(folder.path, tuple(folder.write_table()), tuple(failures))
 
 
-def _cell_status(cell: Cell, standing: Standing, front: FrontJob | None) -> CellStatus:
-    if standing.state == "done":
-        return CellStatus(cell, standing, standing.figures.get("gap"))
-    return CellStatus(cell, standing, None if front is None else front.gap(standing.figures))
+def _cell_status(cell: Cell, status: JobStatus, front: FrontJob | None) -> CellStatus:
+    if status.state == "done":
+        return CellStatus(cell, status, status.figures.get("gap"))
+    return CellStatus(cell, status, None if front is None else front.gap(status.figures))

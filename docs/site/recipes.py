@@ -9,7 +9,7 @@ from typing import Any
 from cirl_marl.definitions.catalogue import networks, recipe_path
 from cirl_marl.learners.recipe import LearnerSettings, Recipe, load_recipe
 from cirl_marl.paper.published import ENVIRONMENTS
-from cirl_marl.paper.selection import tuned_recipe
+from cirl_marl.paper.row_selection import tuned_recipe
 from docs.site.markdown import GeneratedPage, table
 from docs.site.networks import STUDY, check_study, interval
 

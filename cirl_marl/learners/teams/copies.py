@@ -17,7 +17,7 @@ from cirl_marl.network import Floats
 
 MakeEnv = Callable[[], Any]
 """Makes an environment: a PettingZoo ``ParallelEnv`` or ``AECEnv``."""
-Observations = NDArray[Any] | dict[str, NDArray[Any]]
+AgentObservations = NDArray[Any] | dict[str, NDArray[Any]]
 """Observations of an agent in all copies."""
 MASK = "action_mask"
 """Key of an observation, or of the infos, under which PettingZoo's environments tell which actions are legal."""
@@ -75,11 +75,11 @@ class Copies:
         self.present = {name: np.zeros(num_envs, dtype=bool) for name in self.agents}
         self.masks: dict[str, NDArray[np.int8]] = {}
         self.new_episode = np.ones(num_envs, dtype=bool)
-        self._observations: dict[str, Observations] = {
+        self._observations: dict[str, AgentObservations] = {
             name: _blank(self.observation_spaces[name], num_envs) for name in self.agents
         }
 
-    def reset(self, *, seed: Sequence[int] | None = None) -> dict[str, Observations]:
+    def reset(self, *, seed: Sequence[int] | None = None) -> dict[str, AgentObservations]:
         """Begin an episode in every copy, with one of the seeds each; return what everybody sees."""
         self._renew()
         for i in range(self.num_envs):
@@ -208,7 +208,7 @@ class AgentInCopy:
         return getattr(self.env, name)
 
 
-def _blank(space: spaces.Space[Any], copies: int) -> Observations:
+def _blank(space: spaces.Space[Any], copies: int) -> AgentObservations:
     """Return zeros in the form of a space, for copies in which nothing was seen yet."""
     if isinstance(space, spaces.Dict):
         return {key: np.zeros((copies, *(part.shape or ())), dtype=part.dtype) for key, part in space.spaces.items()}
@@ -228,7 +228,7 @@ def _check(agent: str, space: spaces.Space[Any]) -> None:
             )
 
 
-def _put(rows: Observations, i: int, observation: Any, space: spaces.Space[Any], place: str) -> None:
+def _put(rows: AgentObservations, i: int, observation: Any, space: spaces.Space[Any], place: str) -> None:
     """Write what an agent sees into a row."""
     parts = [(None, rows)] if not isinstance(rows, dict) else list(rows.items())
     for key, part in parts:

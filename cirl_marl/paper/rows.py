@@ -22,8 +22,8 @@ from cirl_marl.jobs import Tell
 from cirl_marl.learners.recipe import Recipe, load_recipe
 from cirl_marl.learners.trainer import one_torch_thread
 from cirl_marl.paper.published import PaperEnvironment, environment_of
-from cirl_marl.paper.results import WINDOW, Evaluation, PaperRow, Result, Results, thin_out
-from cirl_marl.paper.selection import tuned_recipe
+from cirl_marl.paper.results import WINDOW, EvaluationFigures, PaperRow, Result, Results, thin_out
+from cirl_marl.paper.row_selection import tuned_recipe
 from cirl_marl.paper.training import Predict, Report, check_registered, describe, train_published, train_tuned
 from cirl_marl.records.machine import processor, versions
 
@@ -33,7 +33,7 @@ EVALUATION_EPISODES = 100
 EVALUATION_COPIES = 20
 
 
-def run_row(row: PaperRow, *, report: Report = lambda what, done, total: None, episodes: int | None = None) -> Result:
+def run_row(row: PaperRow, *, report: Report = lambda stage, done, total: None, episodes: int | None = None) -> Result:
     """Train and evaluate one row; the final policy plays 100 ``episodes``, or the paper's where it counts successes.
 
     Raises:
@@ -135,7 +135,7 @@ def _check_success(environment: PaperEnvironment) -> None:
 
 def evaluate(
     id_: str, predict: Predict, episodes: int, seed: int, report: Report, options: dict[str, Any], *, warm_up: int = 0
-) -> Evaluation:
+) -> EvaluationFigures:
     """Return mean return and share of successes of ``episodes`` fresh episodes.
 
     Each copy plays a fixed number of episodes, so that short ones are not favoured, after ``warm_up`` that do not
@@ -164,7 +164,7 @@ def evaluate(
                 success_count[copy] = False
         report("evaluating", len(returns), episodes)
     env.close()
-    return Evaluation(
+    return EvaluationFigures(
         episodes=len(returns),
         mean=float(np.mean(returns)),
         deviation=float(np.std(returns)),

@@ -11,9 +11,9 @@ from rich.console import Group, RenderableType
 from cirl_marl.controllers.schedule import Schedule
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.assessment import Evaluation
+from cirl_marl.evaluation.compared_quantities import rank_quantities
 from cirl_marl.evaluation.comparison import Comparison
 from cirl_marl.evaluation.pareto import ParetoFront
-from cirl_marl.evaluation.quantities import rank_quantities
 from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.report import report_page
 from cirl_marl.report.decisions import decisions_table, save_decisions, savings_table
@@ -24,11 +24,11 @@ from cirl_marl.report.terminal import evaluation_table
 from cirl_marl.report.tradeoffs import comparison_notes, comparison_table, save_comparison, save_pareto
 from cirl_marl.report.trajectory import draw_trajectory
 
-Result = Simulation | Sequence[Simulation] | Schedule | Comparison | ParetoFront | Evaluation
+Reportable = Simulation | Sequence[Simulation] | Schedule | Comparison | ParetoFront | Evaluation
 """What ``simulate``, ``simulate_alternatives``, ``plan``, ``compare``, ``pareto_front`` and ``evaluate`` return."""
 
 
-def write_report(path: str | Path, result: Result) -> Path:
+def write_report(path: str | Path, result: Reportable) -> Path:
     """Write a report for the browser and return its path: one HTML file, which needs no server.
 
     Args:
@@ -59,7 +59,7 @@ _page.register(Evaluation, page_of_evaluation)
 _page.register(Simulation, lambda simulation: report_page.page_of_alternatives([simulation]))
 
 
-def draw(path: str | Path, result: Result, *, title: str = "") -> Path:
+def draw(path: str | Path, result: Reportable, *, title: str = "") -> Path:
     """Save the picture of a result as a PNG and return its path.
 
     Args:
