@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from typing import Annotated
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Node
 from cirl_marl.network.initial_ages import past_inflows, propagator, slots
 from cirl_marl.network.lifetimes import Chain
@@ -21,8 +20,7 @@ MOST = 2_000
 """Largest number of ages that are."""
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Pyramid:
     """The ages of what is in use in a node, by the control interval in which it entered."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -12,7 +11,7 @@ from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 
 EVALUATION_SEEDS = 2**31
 """First seed of evaluations; training draws its seeds below it, so no evaluated episode was trained on."""
@@ -24,8 +23,7 @@ SEED_SPACING = 1_000_000
 """Distance between the first seeds of two evaluations with different ``seed``, so that they share no episode."""
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class EpisodeStart:
     """Where a single episode begins."""
 
@@ -38,8 +36,7 @@ class EpisodeStart:
         return env.reset(seed=self.seed, options={"initial_state": self.initial_state})
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Rollout:
     """One episode of each of B copies under one controller."""
 

@@ -16,7 +16,7 @@ import numpy as np
 from cirl_marl.drawing.layered import LayeredLayout, layered_layout
 from cirl_marl.drawing.style import readable
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Role
 
 HORIZONTAL, VERTICAL = "lying", "standing"
@@ -61,8 +61,7 @@ class Ribbon:
     recipient: int
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class FlowDiagram:
     """A flow diagram without its numbers; places, breadths and scales are by ``HORIZONTAL`` and ``VERTICAL``."""
 

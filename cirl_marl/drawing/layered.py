@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cirl_marl.network import Floats, Integers
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 
 SWEEPS = 24
 """How often the layers are put in order and moved towards what they are connected with."""
@@ -48,8 +48,7 @@ class RibbonRoute:
     back: bool = False
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class LayeredLayout:
     """Where everything of a flow diagram goes; across is measured from the first lane on."""
 

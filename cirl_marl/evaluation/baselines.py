@@ -8,11 +8,12 @@ least; their multipliers prove a bound for every other start and service, so tha
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from cirl_marl.network import Floats, Network
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.uncertainty import draw_network
 from cirl_marl.optimum import Bound, Envelope, bound, envelope
 
@@ -26,19 +27,15 @@ FRONT = 41
 """Service levels at which the front is drawn."""
 
 
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Baseline:
-    """Proven bounds on λ̄ by start and service.
+    """Proven bounds on λ̄ by start and service."""
 
-    Attributes:
-        envelope: proves them; None if nothing is proved.
-        front: levels demanded of every service and bounds on λ̄ at the mean start, shape (points, 2), by level.
-        reason: why nothing is proved; empty if something is, or nothing was asked for.
-    """
-
-    envelope: Envelope | None
-    front: Floats
-    reason: str = ""
+    envelope: Annotated[Envelope | None, "proves them; None if nothing is proved"]
+    front: Annotated[
+        Floats, "levels demanded of all services and bounds on λ̄ at the mean start, by level, shape (points, 2)"
+    ]
+    reason: Annotated[str, "why nothing is proved; empty if something is, or nothing was asked for"] = ""
 
     def at(self, starts: Floats, levels: Floats) -> Floats | None:
         """Return the bounds of episodes from ``starts``, shape (episodes, nodes), with the mean ``levels`` of services.

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
 
 from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.network import Floats
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.bounds import relative
 
 ROUND_OFF = 1e-12
@@ -27,8 +26,7 @@ NAMES: Mapping[QuantityKind, str] = {
 """What quantities are called, {} standing for the id of the service, arc or node."""
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class ComparedQuantity:
     """A figure of a whole episode in each of A alternatives."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,6 +21,7 @@ from cirl_marl.evaluation.figures import gain
 from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, SHARE, Aggregate, over_episodes, over_seeds
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum import NoCertificate, gap
 
 FIGURES = ("circularity", "gain", "service", "bound", "gap")
@@ -32,23 +34,21 @@ ProgressReport = Callable[[str, float], None]
 """Takes what is being done and the share of all that is done."""
 
 
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Entry:
-    """The episodes of one policy or controller; ``seed``, ``run`` and ``checkpoint`` are of its training, if any.
-
-    Attributes:
-        gain: circularity gain over neutral control from the same start, shape (episodes,).
-        bound: what no λ̄ of an episode from the same start with at least the same mean level of each service exceeds,
-            shape (episodes,), mass; None if nothing is proved.
-    """
+    """The episodes of one policy or controller; ``seed``, ``run`` and ``checkpoint`` are of its training, if any."""
 
     name: str
     seed: int | None
     run: RunDirectory | None
     checkpoint: str
     rollout: Rollout
-    gain: Floats
-    bound: Floats | None
+    gain: Annotated[Floats, "circularity gain over neutral control from the same start, shape (episodes,)"]
+    bound: Annotated[
+        Floats | None,
+        "what no λ̄ of an episode from the same start with at least the same mean level of each service exceeds, "
+        "shape (episodes,), mass; None if nothing is proved",
+    ]
 
     @property
     def circularity(self) -> Floats:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from cirl_marl.evaluation.contenders import differences
 from cirl_marl.jobs import JobStatus, Tell, check_place, raise_first, run_jobs
 from cirl_marl.learners import Recipe, RunDirectory, load_recipe
 from cirl_marl.network import Floats, Network
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum import Bound, Envelope, NoCertificate, bound, improve_plan, simulate_plan
 from cirl_marl.optimum.bounds import highest_service
 from cirl_marl.optimum.mpc import SERVICE_FIRST
@@ -43,22 +45,18 @@ class Point:
     seed: int | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@positional_record
 class ParetoFront:
-    """All points of a network.
-
-    Attributes:
-        recipe: what was trained; None for nothing.
-        reason: why there is no bound; empty if there is.
-        front: levels of every service and what the multipliers of all bounds prove there, shape (levels, 2).
-    """
+    """All points of a network."""
 
     network: Network
-    recipe: Recipe | None
+    recipe: Annotated[Recipe | None, "what was trained; None for nothing"]
     points: tuple[Point, ...]
     runs: tuple[RunDirectory, ...] = ()
-    reason: str = ""
-    front: Floats = field(default_factory=lambda: np.empty((0, 2)))
+    reason: Annotated[str, "why there is no bound; empty if there is"] = ""
+    front: Annotated[
+        Floats, "levels of every service and what the multipliers of all bounds prove there, shape (levels, 2)"
+    ] = field(default_factory=lambda: np.empty((0, 2)))
 
     def of(self, kind: str) -> list[Point]:
         """Return the points of one kind."""

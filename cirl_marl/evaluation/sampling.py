@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType
 from typing import Annotated
@@ -14,7 +13,7 @@ from cirl_marl.controllers.rollout import episode_start, first_seed, rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.registry import named_controller
 
 FEWEST = 70
@@ -23,8 +22,7 @@ RESAMPLES = 200
 """Bootstrap resamples of their intervals."""
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class SampledEpisodes:
     """Episodes of networks whose uncertain numbers were drawn; everything else is the same."""
 
@@ -37,8 +35,7 @@ class SampledEpisodes:
     flow: Annotated[Floats, "mean flows of each interval, shape (samples, steps, arcs), mass/time"]
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Sensitivity:
     """How much of the spread of a figure each uncertain number causes by itself: first-order Sobol indices."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -20,13 +19,12 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.calendar import labels
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.registry import SETTABLE, named_controller
 from cirl_marl.records.files import write_atomically, write_table
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Simulation:
     """One episode of a network under one scenario and one controller."""
 

@@ -45,6 +45,12 @@ def frozen_record(record: type[Part]) -> type[Part]:
     return with_field_docs(dataclass(frozen=True, slots=True, kw_only=True)(record))
 
 
+@dataclass_transform(frozen_default=True)
+def positional_record(record: type[Part]) -> type[Part]:
+    """Make a dataclass as ``frozen_record`` does, whose values may be given by their places too."""
+    return with_field_docs(dataclass(frozen=True, slots=True)(record))
+
+
 def _annotations(record: Any) -> dict[str, Any]:
     hints = get_type_hints(record, include_extras=True)
     metadata = {field.name: getattr(hints[field.name], "__metadata__", ()) for field in fields(record)}

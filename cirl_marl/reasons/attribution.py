@@ -10,7 +10,6 @@ References: Sundararajan, Taly and Yan 2017, Axiomatic attribution for deep netw
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -19,7 +18,7 @@ from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.evaluation.statistics import Aggregate, over_episodes
 from cirl_marl.network import Floats
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import frozen_record
 from cirl_marl.reasons.extras import module_for
 from cirl_marl.reasons.input_signals import Signal, observation_entries, policy_columns, signal_of
 from cirl_marl.reasons.interventions import FixedInputs, RecordedEpisodes, Substitution, play_episodes
@@ -33,8 +32,7 @@ POINTS = 32
 """Points of the Gauss-Legendre rule between the mean and what was seen."""
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_record
 class PairedDifference:
     """How episodes differ from those of the policies from the same starts: means with 95 % intervals over episodes."""
 
@@ -43,8 +41,7 @@ class PairedDifference:
     usual: Annotated[float, "mean λ̄ of the policies, mass"]
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_record
 class AgentInputs:
     """What one agent looks at, first what counts most."""
 

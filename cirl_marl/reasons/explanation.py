@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -17,7 +16,7 @@ from cirl_marl.evaluation.baselines import levels_to_demand
 from cirl_marl.evaluation.comparison import part_of, starting_stocks
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Network
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import frozen_record
 from cirl_marl.optimum import NoCertificate
 from cirl_marl.reasons import extras
 from cirl_marl.reasons.attribution import AgentInputs, attribute_inputs
@@ -30,8 +29,7 @@ PARTS = ("prices", "inputs", "rules")
 TOP = 3
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_record
 class Explanation:
     """Reasons; what was not asked for, or cannot be had, is None."""
 

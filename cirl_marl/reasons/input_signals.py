@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -11,14 +10,13 @@ import numpy as np
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.learners.views import View
 from cirl_marl.network import Integers, Network
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Arc, Law, Node
 
 TIME = "time"
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Signal:
     """An entry of observations."""
 
@@ -47,8 +45,7 @@ def signal_of(network: Network, name: str) -> Signal:
     return Signal(name, about, scale, network.mass_unit if stores or is_batch else rate)
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class PolicyColumns:
     """What stands in the row that a policy sees when it acts for one agent."""
 

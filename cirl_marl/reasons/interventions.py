@@ -13,14 +13,13 @@ from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import RunError
 from cirl_marl.network import Floats, Integers
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 
 if TYPE_CHECKING:
     from cirl_marl.learners.policies import Policies
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class RecordedEpisodes:
     """What agents saw, and what the expert did there."""
 

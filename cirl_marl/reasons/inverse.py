@@ -14,7 +14,7 @@ References: Ahuja and Orlin 2001, Inverse optimization, Operations Research 49, 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -25,7 +25,7 @@ from scipy.optimize import linprog
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import frozen_record
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.certificate import verify
 from cirl_marl.optimum.options import DEGREE
@@ -44,8 +44,7 @@ NARROW = 0.1
 TINY = 1e-9
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_record
 class ObjectiveWeights:
     """The weights under which plans are within a distance of the best.
 

@@ -8,7 +8,7 @@ terms is best for their tangents too, and no plan gains more than the tangents s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Annotated
 
 import numpy as np
@@ -16,7 +16,7 @@ import numpy as np
 from cirl_marl.drawing.style import readable
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Arc, Node, Role
 from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.vintages import Lifetimes
@@ -31,8 +31,7 @@ CIRCULARITY_PARTS = {
 """Parts of λ, by the role of a node at one end of an arc that counts."""
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class PlannedEpisode:
     """What became of a network in one episode."""
 
@@ -42,8 +41,7 @@ class PlannedEpisode:
     flow: Annotated[Floats, "means over the intervals, shape (steps, arcs), mass/time"]
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class LinearFunctional:
     """Weights of what is measured in an episode; None where nothing of a kind counts."""
 
@@ -87,8 +85,7 @@ class LinearFunctional:
         return weights.ravel()
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class ObjectiveTerm:
     """One thing that a plan may be meant to do."""
 

@@ -19,7 +19,7 @@ from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network import Floats, Integers
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import frozen_record, positional_record
 from cirl_marl.reasons.attribution import PairedDifference, paired_difference
 from cirl_marl.reasons.extras import module_for
 from cirl_marl.reasons.input_signals import PolicyColumns, Signal, policy_columns, signal_of
@@ -46,8 +46,7 @@ class Condition:
     high: float
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Leaf:
     """What an agent does under some conditions."""
 
@@ -57,25 +56,22 @@ class Leaf:
     share: Annotated[float, "part of the decisions that it stands for"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_record
 class Rule:
-    """The tree of one agent.
+    """The tree of one agent."""
 
-    Attributes:
-        agent: for whom it acts.
-        leaves: what it does when.
-        explained_variance: part of the variance of the policy's action that it explains; 1 if the action never changes.
-        cost: what changed in episodes in which it acted in the policy's place, and the others by their policies.
-    """
-
-    agent: str
-    leaves: tuple[Leaf, ...]
-    explained_variance: float
-    cost: PairedDifference
+    agent: Annotated[str, "for whom it acts"]
+    leaves: Annotated[tuple[Leaf, ...], "what it does when"]
+    explained_variance: Annotated[
+        float, "part of the variance of the policy's action that it explains; 1 if the action never changes"
+    ]
+    cost: Annotated[
+        PairedDifference,
+        "what changed in episodes in which it acted in the policy's place, and the others by their policies",
+    ]
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_record
 class TeamRules:
     """The rules of all agents."""
 

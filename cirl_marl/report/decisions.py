@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -16,7 +15,7 @@ from cirl_marl.controllers.rollout import Rollout, interval_ends
 from cirl_marl.controllers.schedule import Schedule
 from cirl_marl.drawing.style import SERIES, axis_time, number
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Arc, Compartment, ControlKind, Node
 from cirl_marl.reasons.objective_terms import circularity_part
 from cirl_marl.reasons.sentences import interval_names
@@ -29,8 +28,7 @@ SHOWN_LEVERS = 10
 NO_WORKBOOK = "no workbook (.xlsx) beside it: it needs openpyxl: pip install 'cirl-marl[excel]'"
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Setting:
     """One thing that an agent sets."""
 
@@ -42,8 +40,7 @@ class Setting:
     row: Annotated[int, "place among all controls"]
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Lever(Setting):
     """What one agent sets in an episode, beside what it would be if nobody acted."""
 

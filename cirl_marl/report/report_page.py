@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Annotated
 
 import numpy as np
@@ -21,7 +21,7 @@ from cirl_marl.evaluation.sampling import SampledEpisodes
 from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.evaluation.statistics import SHARE, Aggregate, over_episodes
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.mpc import SERVICE_FIRST, Optimum
 
 QUANTILES = (0.025, 0.5, 0.975)
@@ -30,8 +30,7 @@ CONFIDENCE = "mean of {} episodes, with its 95 % interval"
 SAMPLES = "median of {} samples, and what 95 % of them lie within"
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Band:
     """A figure over time, with the ends of an interval if there is one."""
 
@@ -40,8 +39,7 @@ class Band:
     high: Annotated[Floats | None, "likewise"] = None
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class PageEpisode:
     """One trajectory of a network: who acts, and what became of it."""
 
@@ -60,8 +58,7 @@ class PageEpisode:
     )
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class PlanePoint:
     """A point in the plane of service and circularity."""
 
@@ -71,8 +68,7 @@ class PlanePoint:
     about: Annotated[str, "what it is, further"] = ""
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class ReportPage:
     """All that one page shows."""
 

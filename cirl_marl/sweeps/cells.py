@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from cirl_marl.evaluation.statistics import SHARE, over_episodes
 from cirl_marl.jobs import Tell
 from cirl_marl.learners.recipe import Recipe, load_recipe
 from cirl_marl.learners.run_directory import RunDirectory
+from cirl_marl.network.declarations import frozen_record
 from cirl_marl.records.files import write_json
 from cirl_marl.sweeps.reading import SweepEvaluation, SweepFile
 
@@ -36,25 +37,18 @@ def plain_name(words: str) -> str:
     return re.sub(r"[^\w-]", "_", words)[:100]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_record
 class Cell:
-    """A training run of a sweep and its evaluation.
+    """A training run of a sweep and its evaluation."""
 
-    Attributes:
-        address: of the network, as ``load_network`` takes it.
-        options: of ``train``, by name.
-        definition_sha256: of the network under its scenario, data files included.
-        origins: hashes of the policies with which learners begin.
-    """
-
-    address: str
+    address: Annotated[str, "of the network, as ``load_network`` takes it"]
     network: str
     scenario: str
     recipe: Recipe
     seed: int
-    options: tuple[tuple[str, Any], ...]
-    definition_sha256: str
-    origins: str = ""
+    options: Annotated[tuple[tuple[str, Any], ...], "of ``train``, by name"]
+    definition_sha256: Annotated[str, "of the network under its scenario, data files included"]
+    origins: Annotated[str, "hashes of the policies with which learners begin"] = ""
 
     @property
     def steps(self) -> int:

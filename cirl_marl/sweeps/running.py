@@ -3,43 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from cirl_marl.jobs import Failure, Job, JobStatus, check_place, run_jobs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.sweeps.cells import Cell, cells_of
 from cirl_marl.sweeps.folder import SweepFolder, jobs_of
 from cirl_marl.sweeps.fronts import FrontJob
 from cirl_marl.sweeps.reading import load_sweep
 
 
-@dataclass(frozen=True, slots=True)
+@positional_record
 class CellStatus:
-    """How far a cell is.
-
-    Attributes:
-        job_status: how far the work on it is.
-        gap: to the bound: that of its result, or about that of the best policies so far; None if it is not known.
-    """
+    """How far a cell is."""
 
     cell: Cell
-    job_status: JobStatus
-    gap: float | None
+    job_status: Annotated[JobStatus, "how far the work on it is"]
+    gap: Annotated[
+        float | None,
+        "to the bound: that of its result, or about that of the best policies so far; None if it is not known",
+    ]
 
 
-@dataclass(frozen=True, slots=True)
+@positional_record
 class SweepOutcome:
-    """What came of a sweep.
-
-    Attributes:
-        rows: a row for each cell, as in ``sweep.csv``.
-        failures: cells, and bounds, that were not done, and why.
-    """
+    """What came of a sweep."""
 
     folder: Path
-    rows: tuple[Mapping[str, Any], ...]
-    failures: tuple[Failure, ...]
+    rows: Annotated[tuple[Mapping[str, Any], ...], "a row for each cell, as in ``sweep.csv``"]
+    failures: Annotated[tuple[Failure, ...], "cells, and bounds, that were not done, and why"]
 
 
 def sweep(
