@@ -22,6 +22,7 @@ from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.solver import solve
 from cirl_marl.optimum.vintages import Lifetimes
 from cirl_marl.reasons.prices import shadow_prices, with_bound
+from cirl_marl.reasons.sentences import price_sentences
 
 Floats = NDArray[np.floating]
 
@@ -181,6 +182,20 @@ def test_a_cycle_against_programs_solved_again() -> None:
         stocks[i] += 1e-3
         rise = (optimum(bound(network, stocks, min_service=0.9)) - basic) / 1e-3
         assert found.stock[0, i] == pytest.approx(rise, rel=1e-2, abs=1e-5), node.id
+
+
+def test_sentences_keep_the_sign_of_a_price() -> None:
+    """What is worth something late and costs something at the start is said so, and not as if both were alike."""
+    network = load_network("copper_net").with_options(episode={"horizon": 4})
+    prices = shadow_prices(network)
+    worth = np.zeros_like(prices.stock)
+    for start, late, words in (
+        (-0.00289, 0.5, "raises λ̄ by up to 0.5 kt at day 0.75, and lowers it by 0.00289 kt at the start."),
+        (0.00289, 0.5, "raises λ̄ by up to 0.5 kt at day 0.75, by 0.00289 kt at the start."),
+        (0.00289, -0.5, "lowers λ̄ by up to 0.5 kt at day 0.75, and raises it by 0.00289 kt at the start."),
+    ):
+        worth[0, 0], worth[-1, 0] = start, late
+        assert any(sentence.endswith(words) for sentence in price_sentences(replace(prices, stock=worth)))
 
 
 def test_what_has_no_certificate_has_no_prices() -> None:

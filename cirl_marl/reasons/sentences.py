@@ -57,11 +57,12 @@ def price_sentences(prices: ShadowPrices) -> list[str]:
         worth = prices.stock[:, i]
         step = int(np.abs(worth).argmax())
         moment = f"in {times[step]}" if times[step].isdigit() else f"at {times[step]}"
-        change = f"{abs(worth[step]):.3g} {mass} {moment}"
+        verb, opposite = ("raises", "lowers") if worth[step] > 0 else ("lowers", "raises")
+        change = f"{verb} λ̄ by up to {abs(worth[step]):.3g} {mass} {moment}"
         if abs(worth[0]) < abs(worth[step]):
-            change += f", by {number(float(abs(worth[0])))} {mass} at the start"
-        stock, verb = compartment_label(network, network.stores[i].id), "raises" if worth[step] > 0 else "lowers"
-        sentences.append(f"One more {mass} in {stock} {verb} λ̄ by up to {change}.")
+            change += "," if worth[0] * worth[step] >= 0 else f", and {opposite} it"
+            change += f" by {number(float(abs(worth[0])))} {mass} at the start"
+        sentences.append(f"One more {mass} in {compartment_label(network, network.stores[i].id)} {change}.")
     demand = prices.demand.sum(axis=0)
     for s, service in enumerate(network.services):
         if prices.demand.any() and abs(demand[s]) > SMALL * np.abs(demand).max():
