@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Node
 from cirl_marl.network.split_fractions import Split, splits
 from cirl_marl.optimum.matrices import Layout
@@ -24,23 +26,16 @@ class NoCertificate(CirlError):
     """A network for which no upper bound is proved; the message says why."""
 
 
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class FreeSplit:
-    """A split of what leaves a node in which some share can be chosen.
+    """A split of what leaves a node in which some share can be chosen."""
 
-    Attributes:
-        donor: the node.
-        arcs: those with a control, then the others, which keep their proportions.
-        leader: of the others the greatest.
-        followers: the rest of them.
-        ratio: these as parts of the leader.
-    """
-
-    donor: int
-    arcs: Integers
-    leader: int
-    followers: Integers
-    ratio: Floats
+    donor: Annotated[int, "the node"]
+    arcs: Annotated[Integers, "those with a control, then the others, which keep their proportions"]
+    leader: Annotated[int, "of the others the greatest"]
+    followers: Annotated[Integers, "the rest of them"]
+    ratio: Annotated[Floats, "these as parts of the leader"]
 
     @classmethod
     def of(cls, split: Split, donor: int, step: int) -> FreeSplit:
@@ -52,48 +47,7 @@ class FreeSplit:
         return cls(donor, arcs, split.other_arcs[first], free_arcs[rest], proportions[rest] / proportions[first])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class IntervalRanges:
-    """The ranges of the flows in the intervals of one kind; pairs are lowest and highest.
-
-    Attributes:
-        network: whose flows they are.
-        driver: node that drives each arc; −1 for scheduled flows, shape (arcs,).
-        scheduled: arcs that flow by schedule, as far as their donor holds enough, shape (arcs,).
-        proportional: arcs whose flow is a rate times what drives it: no schedule, no lifetime, shape (arcs,).
-        share_arcs: arcs that share what leaves their donor, shape (arcs,).
-        base: a_k, shape (arcs,).
-        setting: w_k or u_k, shape (2, arcs).
-        valve: v of each node, shape (2, nodes).
-        rate: coefficient of each arc, 1/time for stock-driven arcs, a share for what a node passes on, mass/time for
-            scheduled ones, shape (2, arcs).
-        neutral_rate: the same while nobody acts, shape (arcs,).
-        neutral_valve: v while nobody acts, shape (nodes,).
-        release: rate at which each stock is released to be shared out, 1/time, shape (2, nodes).
-        exits: rate at which each stock leaves in proportion to itself, 1/time, shape (2, nodes).
-        free_splits: the splits in which some share can be chosen.
-        followers: arcs whose flows follow from one with which they share what others leave.
-        service_low: lower end of the band of each service, shape (services,).
-    """
-
-    network: Network
-    driver: Integers
-    by_schedule: NDArray[np.bool_]
-    proportional: NDArray[np.bool_]
-    share_arcs: NDArray[np.bool_]
-    base: Floats
-    setting: Floats
-    valve: Floats
-    rate: Floats
-    neutral_rate: Floats
-    neutral_valve: Floats
-    release: Floats
-    exits: Floats
-    free_splits: tuple[FreeSplit, ...]
-    followers: Integers
-    service_low: Floats
-
-
+@with_field_docs
 @dataclass(frozen=True, kw_only=True)
 class Admissible:
     """The ranges of the factors of every flow, f_k = v·w_k·a_k·y_p for driven flows, u_k·v for scheduled ones.
@@ -101,33 +55,23 @@ class Admissible:
     y_p is a stock or, of what leaves a node that stores nothing, its throughput; v is the valve of the donor and w_k or
     u_k the arc's own control or share. Each factor is a single value if nobody acts on it, and may differ from interval
     to interval.
-
-    Attributes:
-        network: whose flows they are, with lifetimes as the program sees them.
-        lifetimes: how that stands for the network that was given.
-        actuators: who acts, and by which controls.
-        driver: node p that drives each arc; −1 for scheduled flows, shape (arcs,).
-        base: a_k, 1/time (1 for what a node passes on), or the mean of the schedule over each interval, mass/time (1
-            if a control sets the flow), shape (steps, arcs).
-        setting: lowest and highest w_k or u_k, shape (2, steps, arcs).
-        valve: lowest and highest v of each node, shape (2, steps, nodes).
-        neutral_setting: w_k or u_k while nobody acts, shape (steps, arcs).
-        neutral_valve: v while nobody acts, shape (steps, nodes).
-        service_low: lower end of the band of each service, shape (steps, services).
-        splits: the arcs that share what leaves a node.
     """
 
-    network: Network
-    lifetimes: Lifetimes
-    actuators: Actuators
-    driver: Integers
-    base: Floats
-    setting: Floats
-    valve: Floats
-    neutral_setting: Floats
-    neutral_valve: Floats
-    service_low: Floats
-    splits: tuple[Split, ...]
+    network: Annotated[Network, "whose flows they are, with lifetimes as the program sees them"]
+    lifetimes: Annotated[Lifetimes, "how that stands for the network that was given"]
+    actuators: Annotated[Actuators, "who acts, and by which controls"]
+    driver: Annotated[Integers, "node p that drives each arc; −1 for scheduled flows, shape (arcs,)"]
+    base: Annotated[
+        Floats,
+        "a_k, 1/time (1 for what a node passes on), or the mean of the schedule over each interval, mass/time (1 if a "
+        "control sets the flow), shape (steps, arcs)",
+    ]
+    setting: Annotated[Floats, "lowest and highest w_k or u_k, shape (2, steps, arcs)"]
+    valve: Annotated[Floats, "lowest and highest v of each node, shape (2, steps, nodes)"]
+    neutral_setting: Annotated[Floats, "w_k or u_k while nobody acts, shape (steps, arcs)"]
+    neutral_valve: Annotated[Floats, "v while nobody acts, shape (steps, nodes)"]
+    service_low: Annotated[Floats, "lower end of the band of each service, shape (steps, services)"]
+    splits: Annotated[tuple[Split, ...], "the arcs that share what leaves a node"]
 
     @classmethod
     def of(cls, network: Network, agents: Sequence[str] | None = None) -> Admissible:
@@ -200,7 +144,10 @@ class Admissible:
 
     @cached_property
     def rate(self) -> Floats:
-        """Lowest and highest coefficient of each arc in each interval (see ``IntervalRanges``), (2, steps, arcs)."""
+        """Lowest and highest coefficient of each arc, shape (2, steps, arcs).
+
+        1/time for stock-driven arcs, a share for what a node passes on, mass/time for scheduled ones.
+        """
         return self.setting * self.valve[:, :, self.network.donors] * self.base
 
     @cached_property
@@ -226,41 +173,42 @@ class Admissible:
     @cached_property
     def ranges(self) -> dict[int, IntervalRanges]:
         """The ranges in the intervals of each kind."""
-        return {kind: self._ranges_of(kind) for kind in np.unique(self.kinds).tolist()}
+        return {kind: IntervalRanges(self, kind) for kind in np.unique(self.kinds).tolist()}
 
-    def _ranges_of(self, step: int) -> IntervalRanges:
-        network, rate, setting = self.network, self.rate[:, step], self.setting[:, step]
-        donors, nodes = network.donors, len(network.nodes)
-        release = np.zeros((2, nodes))
-        free_splits = []
-        for split in self.splits:
+
+class IntervalRanges:
+    """The ranges of the flows in the intervals of one kind: what ``Admissible`` has of them, and what follows from it.
+
+    Attributes:
+        proportional: arcs whose flow is a rate times what drives it: no schedule, no lifetime, shape (arcs,).
+        release: rate at which each stock is released to be shared out, lowest and highest, 1/time, shape (2, nodes).
+        exits: rate at which each stock leaves in proportion to itself, likewise.
+        free_splits: the splits in which some share can be chosen.
+        followers: arcs whose flows follow from one with which they share what others leave.
+    """
+
+    def __init__(self, admissible: Admissible, step: int) -> None:
+        """Take those of one interval."""
+        network = self.network = admissible.network
+        self.by_schedule, self.share_arcs = admissible.by_schedule, admissible.share_arcs
+        self.setting, self.valve = admissible.setting[:, step], admissible.valve[:, step]
+        self.rate, self.base = admissible.rate[:, step], admissible.base[step]
+        self.neutral_rate, self.neutral_valve = admissible.neutral_rate[step], admissible.neutral_valve[step]
+        self.driver, self.service_low = admissible.driver, admissible.service_low[step]
+        self.proportional = ~self.by_schedule
+        self.proportional[admissible.lifetimes.exit_arcs] = False
+        self.release = np.zeros((2, len(network.nodes)))
+        self.free_splits = []
+        for split in admissible.splits:
             donor, arcs = network.node_index[split.donor], [*split.controlled_arcs, *split.other_arcs]
-            release[:, donor] = self.valve[:, step, donor] * self.base[step, split.other_arcs[0]]
-            if (setting[0] < setting[1])[arcs].any():
-                free_splits.append(FreeSplit.of(split, donor, step))
+            self.release[:, donor] = self.valve[:, donor] * self.base[split.other_arcs[0]]
+            if (self.setting[0] < self.setting[1])[arcs].any():
+                self.free_splits.append(FreeSplit.of(split, donor, step))
+        self.followers = np.concatenate([np.zeros(0, dtype=np.intp), *(split.followers for split in self.free_splits)])
         # shares of a release do not leave one by one: the release as a whole does
-        single = rate * ((self.driver == donors) & ~self.share_arcs)
-        exits = np.array([np.bincount(donors, bound, nodes) for bound in single], dtype=float) + release
-        proportional = ~self.by_schedule
-        proportional[self.lifetimes.exit_arcs] = False
-        return IntervalRanges(
-            network=network,
-            driver=self.driver,
-            by_schedule=self.by_schedule,
-            proportional=proportional,
-            share_arcs=self.share_arcs,
-            base=self.base[step],
-            setting=setting,
-            valve=self.valve[:, step],
-            rate=rate,
-            neutral_rate=self.neutral_rate[step],
-            neutral_valve=self.neutral_valve[step],
-            release=release,
-            exits=exits,
-            free_splits=tuple(free_splits),
-            followers=np.concatenate([np.zeros(0, dtype=np.intp), *(split.followers for split in free_splits)]),
-            service_low=self.service_low[step],
-        )
+        single = self.rate * ((self.driver == network.donors) & ~self.share_arcs)
+        leaving = [np.bincount(network.donors, bound, len(network.nodes)) for bound in single]
+        self.exits = np.array(leaving, dtype=float) + self.release
 
 
 def share_ranges(split: Split, wishes: Floats) -> Floats:

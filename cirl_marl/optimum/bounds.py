@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,8 +14,9 @@ from scipy import sparse
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
+from cirl_marl.network.declarations import frozen_record, with_field_docs
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
-from cirl_marl.optimum.certificate import Certificate, Verification, dual_bound, verify
+from cirl_marl.optimum.certificate import Certificate, Verification, verify
 from cirl_marl.optimum.options import (
     DEGREE,
     by_stage,
@@ -45,49 +47,30 @@ def gap(bound: ArrayLike, value: ArrayLike) -> Floats:
     return relative(np.subtract(bound, value), bound)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_record
 class Bound:
-    """An upper bound of an objective for one start, its certificate, and the plan that suggests itself.
+    """An upper bound of an objective for one start, its certificate, and the plan that suggests itself."""
 
-    Attributes:
-        network: the network, under the scenario and horizon that the bound is for.
-        agents: who acts; the others are neutral.
-        initial: stocks at the start as the simulator has them, by stage where there is a lifetime, mass.
-        objective: the bound, proved by ``verify()``: of λ̄ (mass), or of λ̄/scale + w·service with a service weight.
-        value: the bound on λ̄, or with a service weight λ̄ of the plan, mass.
-        service: mean service level of the plan.
-        levels: mean level of each service under the plan, shape (services,).
-        service_weight: w; None if the objective is λ̄.
-        min_service: mean level demanded of each service, shape (services,); None for none.
-        degree: degree of the test polynomials.
-        circularity: mean of λ over each interval under the plan, shape (steps,), mass.
-        stock: planned stocks at the start and after each interval, shape (steps + 1, stores), mass.
-        flow: planned mean flows, shape (steps, arcs), mass/time.
-        actions: normalised actions that come closest to the plan, shape (steps, entries).
-        problem: the linear program.
-        solution: its variables under the plan.
-        certificate: the multipliers.
-        basis: from which the program of another start may be solved; None if it was solved without.
-    """
-
-    network: Network
-    agents: tuple[str, ...]
-    initial: Floats
-    objective: float
-    value: float
-    service: float
-    levels: Floats
-    service_weight: float | None
-    min_service: Floats | None
-    degree: int
-    circularity: Floats
-    stock: Floats
-    flow: Floats
-    actions: Floats
-    problem: Program
-    solution: Floats
-    certificate: Certificate
-    basis: Basis | None
+    network: Annotated[Network, "the network, under the scenario and horizon that the bound is for"]
+    agents: Annotated[tuple[str, ...], "who acts; the others are neutral"]
+    initial: Annotated[Floats, "stocks at the start as the simulator has them, with a lifetime by stage, mass"]
+    objective: Annotated[
+        float, "the bound, proved by ``verify()``: of λ̄, mass, or with a service weight of λ̄/scale + w·service"
+    ]
+    value: Annotated[float, "the bound on λ̄, or with a service weight λ̄ of the plan, mass"]
+    service: Annotated[float, "mean service level of the plan"]
+    levels: Annotated[Floats, "mean level of each service under the plan, shape (services,)"]
+    service_weight: Annotated[float | None, "w; None if the objective is λ̄"]
+    min_service: Annotated[Floats | None, "mean level demanded of each service, shape (services,); None for none"]
+    degree: Annotated[int, "degree of the test polynomials"]
+    circularity: Annotated[Floats, "mean of λ over each interval under the plan, shape (steps,), mass"]
+    stock: Annotated[Floats, "planned stocks at the start and after each interval, shape (steps + 1, stores), mass"]
+    flow: Annotated[Floats, "planned mean flows, shape (steps, arcs), mass/time"]
+    actions: Annotated[Floats, "normalised actions that come closest to the plan, shape (steps, entries)"]
+    problem: Annotated[Program, "the linear program"]
+    solution: Annotated[Floats, "its variables under the plan"]
+    certificate: Annotated[Certificate, "the multipliers"]
+    basis: Annotated[Basis | None, "from which the program of another start may be solved; None if solved without"]
 
     def __str__(self) -> str:
         """Say what is proved, in one line."""
@@ -144,15 +127,12 @@ class Bound:
         return gap(self.objective, value)
 
 
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class Envelope:
-    """Bounds of one objective, solved for different starts; at any start the least of what they prove holds.
+    """Bounds of one objective, solved for different starts; at any start the least of what they prove holds."""
 
-    Attributes:
-        members: the bounds, of the same network, agents, objective and degree.
-    """
-
-    members: tuple[Bound, ...]
+    members: Annotated[tuple[Bound, ...], "the bounds, of the same network, agents, objective and degree"]
 
     def at(self, initial: ArrayLike | None = None, min_service: ArrayLike | None = None) -> Floats:
         """Return the least of the bounds that the members prove; see ``Bound.at``, whose defaults are the first's."""
@@ -169,7 +149,7 @@ class Envelope:
         for i in np.ndindex(shape):
             check_stocks(state_layout, starts[i])
             problem = programs.program(starts[i], None if levels is None else levels[i])
-            bounds[i] = min(dual_bound(problem, member.certificate) for member in self.members)
+            bounds[i] = min(verify(problem, member.certificate, member.solution).bound for member in self.members)
         return bounds
 
 

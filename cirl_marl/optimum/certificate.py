@@ -3,47 +3,35 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats
+from cirl_marl.network.declarations import frozen_record
 from cirl_marl.optimum.program import Program
 
 EPSILON = float(np.finfo(float).eps)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_record
 class Verification:
-    """What a certificate proves.
+    """What a certificate proves."""
 
-    Attributes:
-        bound: upper bound of the objective for all plans, rounding errors included.
-        objective: objective of the plan that came with it; ``bound − objective`` is what the solver left open.
-        infeasibility: largest amount by which a multiplier of an inequality had the wrong sign; it was set to zero.
-        charged: part of the bound due to reduced costs of less than 1e-6 of the largest cost, the solver's tolerance.
-        rounding: allowance for rounding errors, included in the bound.
-    """
-
-    bound: float
-    objective: float
-    infeasibility: float
-    small_costs: float
-    rounding: float
+    bound: Annotated[float, "upper bound of the objective for all plans, rounding errors included"]
+    objective: Annotated[float, "that of the plan that came along; ``bound − objective`` is what the solver left open"]
+    infeasibility: Annotated[float, "most by which a multiplier of an inequality had the wrong sign; it is set to 0"]
+    small_costs: Annotated[float, "part of the bound due to reduced costs below 1e-6 of the largest cost"]
+    rounding: Annotated[float, "allowance for rounding errors, included in the bound"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_record
 class Certificate:
-    """Multipliers of the rows of a program.
+    """Multipliers of the rows of a program."""
 
-    Attributes:
-        equal: of A v = b, any sign, shape (rows of A,).
-        under: of G v ≤ g, at most 0, shape (rows of G,).
-    """
-
-    equal: Floats
-    under: Floats
+    equal: Annotated[Floats, "of A v = b, any sign, shape (rows of A,)"]
+    under: Annotated[Floats, "of G v ≤ g, at most 0, shape (rows of G,)"]
 
 
 def verify(problem: Program, certificate: Certificate, plan: Floats) -> Verification:
@@ -65,24 +53,6 @@ def verify(problem: Program, certificate: Certificate, plan: Floats) -> Verifica
     Raises:
         CirlError: for a multiplier that is not finite; names its row.
     """
-    bound, rounding, reduced_cost, columns = _dual_bound(problem, certificate)
-    small = np.abs(reduced_cost) < 1e-6 * np.abs(problem.cost).max(initial=0.0)
-    return Verification(
-        bound=bound,
-        objective=problem.constant - math.fsum(problem.cost * plan),
-        infeasibility=float(np.maximum(certificate.under, 0.0).max(initial=0.0)),
-        small_costs=-math.fsum(columns[small]),
-        rounding=rounding,
-    )
-
-
-def dual_bound(problem: Program, certificate: Certificate) -> float:
-    """Return the bound of ``verified`` alone."""
-    return _dual_bound(problem, certificate)[0]
-
-
-def _dual_bound(problem: Program, certificate: Certificate) -> tuple[float, float, Floats, Floats]:
-    """Return the bound, the allowance for rounding in it, d, and min(d_j l_j, d_j u_j)."""
     for rows, multipliers in (("A", certificate.equal), ("G", certificate.under)):
         if not np.isfinite(multipliers).all():
             row = int(np.flatnonzero(~np.isfinite(multipliers))[0])
@@ -96,4 +66,11 @@ def _dual_bound(problem: Program, certificate: Certificate) -> tuple[float, floa
     terms = np.concatenate([problem.equal_to * y, problem.under_to * mu, columns])
     # twice what the errors can be, which leaves room for the errors of these two sums
     rounding = 2 * EPSILON * (float(terms_per_column * size @ reach) + 4 * float(np.abs(terms).sum()))
-    return problem.constant - math.fsum(terms) + rounding, rounding, reduced_cost, columns
+    small = np.abs(reduced_cost) < 1e-6 * np.abs(problem.cost).max(initial=0.0)
+    return Verification(
+        bound=problem.constant - math.fsum(terms) + rounding,
+        objective=problem.constant - math.fsum(problem.cost * plan),
+        infeasibility=float(np.maximum(certificate.under, 0.0).max(initial=0.0)),
+        small_costs=-math.fsum(columns[small]),
+        rounding=rounding,
+    )

@@ -17,8 +17,8 @@ References: Rubinstein 1999; Pinneri et al. 2020 (elites kept from one iteration
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,6 +29,7 @@ from cirl_marl.controllers.scripted import ScriptController
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.declarations import frozen_record
 from cirl_marl.optimum.options import DEGREE, check_options, demanded_levels
 from cirl_marl.optimum.planned_episodes import Episodes, Population, by_state_name, starting_states
 
@@ -49,33 +50,22 @@ SPREAD_DECAY = 0.7
 """Standard deviation at the beginning of a refinement against that of the one before."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_record
 class Incumbent:
-    """The best plan found from one start, without certificate: nothing says how much better another could be.
+    """The best plan found from one start, without certificate: nothing says how much better another could be."""
 
-    Attributes:
-        network: the network, under the scenario and horizon that the plan is for.
-        agents: who acts; the others are neutral.
-        initial: stocks and inner states at the start, the first of ``MultiAgentVectorEnv.state_names``, shape (rows,).
-        actions: normalised actions, shape (steps, entries).
-        circularity: λ̄ that the plan achieves in the simulator, mass.
-        service: mean service level that it achieves.
-        levels: mean level of each service, shape (services,).
-        candidates: λ̄ and mean service level of each controller that the search could begin with.
-        origin: the candidate that it began with.
-        evaluations: episodes simulated from this start, those of the candidates included.
-    """
-
-    network: Network
-    agents: tuple[str, ...]
-    initial: Floats
-    actions: Floats
-    circularity: float
-    service: float
-    levels: Floats
-    candidates: Mapping[str, tuple[float, float]]
-    origin: str
-    evaluations: int
+    network: Annotated[Network, "the network, under the scenario and horizon that the plan is for"]
+    agents: Annotated[tuple[str, ...], "who acts; the others are neutral"]
+    initial: Annotated[Floats, "stocks and inner states at the start, the first of ``state_names``, shape (rows,)"]
+    actions: Annotated[Floats, "normalised actions, shape (steps, entries)"]
+    circularity: Annotated[float, "λ̄ that the plan achieves in the simulator, mass"]
+    service: Annotated[float, "mean service level that it achieves"]
+    levels: Annotated[Floats, "mean level of each service, shape (services,)"]
+    candidates: Annotated[
+        Mapping[str, tuple[float, float]], "λ̄ and mean service level of each controller to begin with"
+    ]
+    origin: Annotated[str, "the candidate that it began with"]
+    evaluations: Annotated[int, "episodes simulated from this start, those of the candidates included"]
 
     def __str__(self) -> str:
         """Say what the plan achieves, and that nothing is proved about others."""
@@ -175,8 +165,7 @@ def search_each(
             raise CirlError(f"{name} must be a whole number of at least {least}, got {value!r}")
     if knots > network.episode.horizon:
         raise CirlError(f"knots: {knots} are more than the {network.episode.horizon} decisions of an episode")
-    demand = None if min_service is None else demanded_levels(network, min_service)
-    objective = _Objective(network.objective.circularity_scale, service_weight, demand)
+    demand = np.zeros(0) if min_service is None else demanded_levels(network, min_service)
     starts = np.asarray(initial, dtype=float)
     copies = Population(network, agents, starts, population)
     options = standard_candidates(copies.agents) if candidates is None else dict(candidates)
@@ -186,6 +175,15 @@ def search_each(
     highest = np.full(len(starts), -np.inf)
     episodes_done = 0
 
+    def objective(episodes: Episodes) -> Floats:
+        value: Floats = episodes.circularity / network.objective.circularity_scale
+        if service_weight is not None:
+            value = value + service_weight * episodes.service
+        if min_service is not None:
+            lack = np.maximum(0.0, demand[:, None, None] - episodes.levels)
+            value = value - SHORTFALL_PRICE * lack.sum(axis=0)
+        return value
+
     def report(episodes: int) -> Callable[[float], None]:
         return lambda share: progress((episodes_done + episodes * share) / evaluations, highest)
 
@@ -194,7 +192,7 @@ def search_each(
     first = Population(network, copies.agents, starts, len(options)).run(
         controllers, entrants, np.zeros((*entrants.shape, 1, copies.entries)), report(len(options))
     )
-    best = _Best.among(first, objective.of(first))
+    best = _Best.among(first, objective(first))
     origin = best.copy
     gaussians = Gaussians(best.objective, population, copies.entries, seed)
     episodes_done, highest = len(options), best.objective
@@ -202,8 +200,8 @@ def search_each(
         gaussians.refine(count)
         controller = np.repeat(origin[:, None], population, axis=1)
         trial = copies.run(controllers, controller, gaussians.draw(), report(population))
-        gaussians.learn(objective.of(trial), trial.deviation)
-        best = best.or_better(_Best.among(trial, objective.of(trial)))
+        gaussians.learn(objective(trial), trial.deviation)
+        best = best.or_better(_Best.among(trial, objective(trial)))
         episodes_done, highest = episodes_done + population, best.objective
     progress(1.0, best.objective)
     return [
@@ -215,9 +213,9 @@ def search_each(
             circularity=float(best.circularity[i]),
             service=float(best.service[i]),
             levels=best.levels[i],
-            candidates=dict(
-                zip(options, zip(first.circularity[i].tolist(), first.service[i].tolist(), strict=True), strict=True)
-            ),
+            candidates={
+                name: (float(first.circularity[i, c]), float(first.service[i, c])) for c, name in enumerate(options)
+            },
             origin=list(options)[origin[i]],
             evaluations=evaluations,
         )
@@ -232,37 +230,8 @@ def standard_candidates(agents: Sequence[str]) -> dict[str, Controller]:
     return {"neutral": Neutral(), "scripted": ScriptController(), **constants}
 
 
-@dataclass(frozen=True, slots=True)
-class _Objective:
-    """What is maximised; see ``search``."""
-
-    scale: float
-    service_weight: float | None
-    min_service: Floats | None
-
-    def of(self, episodes: Episodes) -> Floats:
-        """Return the objective of each episode, shape (starts, copies)."""
-        objective: Floats = episodes.circularity / self.scale
-        if self.service_weight is not None:
-            objective = objective + self.service_weight * episodes.service
-        if self.min_service is not None:
-            lack = np.maximum(0.0, self.min_service[:, None, None] - episodes.levels)
-            objective = objective - SHORTFALL_PRICE * lack.sum(axis=0)
-        return objective
-
-
-@dataclass(frozen=True, slots=True)
-class _Best:
-    """The best episode from each start.
-
-    Attributes:
-        copy: which of the copies it was, shape (starts,).
-        objective: shape (starts,).
-        circularity: λ̄, shape (starts,), mass.
-        service: mean service level, shape (starts,).
-        levels: of each service, shape (starts, services).
-        actions: shape (starts, steps, entries).
-    """
+class _Best(NamedTuple):
+    """The best episode from each start: which of the copies it was, and what it was like, shape (starts, …)."""
 
     copy: Integers
     objective: Floats
@@ -282,14 +251,8 @@ class _Best:
     def or_better(self, rival: _Best) -> _Best:
         """Return the better of the two from each start, these if they are equal."""
         better = rival.objective > self.objective
-        return _Best(
-            np.where(better, rival.copy, self.copy),
-            np.where(better, rival.objective, self.objective),
-            np.where(better, rival.circularity, self.circularity),
-            np.where(better, rival.service, self.service),
-            np.where(better[:, None], rival.levels, self.levels),
-            np.where(better[:, None, None], rival.actions, self.actions),
-        )
+        pairs = zip(rival, self, strict=True)
+        return _Best(*(np.where(better.reshape(-1, *[1] * (own.ndim - 1)), other, own) for other, own in pairs))
 
 
 class Gaussians:

@@ -82,9 +82,9 @@ class _Motion:
 
     Attributes:
         whole: e^(Aδ), shape (stages, stages).
-        left: what leaves, weighted with B_i and times (d + 1), of what is there at its start, shape (d + 1, stages).
+        outflow: what leaves, weighted with B_i and times (d + 1), of what is there at its start, shape (d + 1, stages).
         later: of what enters in the piece, where it is at its end.
-        own: enclosure of what leaves in the piece of what enters in it, shape (d + 1, d + 1) each.
+        own_bounds: enclosure of what leaves in the piece of what enters in it, shape (d + 1, d + 1) each.
     """
 
     def __init__(self, unit: Floats, turnover: float, inflow_shares: Floats, degree: int) -> None:
@@ -100,8 +100,7 @@ class _Motion:
         start[stages:] = np.stack([_derivatives(degree, degree - i) for i in range(degree + 1)], axis=1)
         last = np.zeros((1, stages + degree + 1))
         last[0, stages - 1] = turnover
-        low, high = _Smooth(block_matrix, start, degree).bounds(last)
-        self.own_bounds = low, high
+        self.own_bounds = _Smooth(block_matrix, start, degree).bounds(last)
 
 
 class _Smooth:
@@ -169,12 +168,8 @@ def _derivatives(degree: int, j: int) -> Floats:
 
 def _to_bernstein(degree: int) -> Floats:
     """Return what turns coefficients of powers into those of B_j, shape (d + 1, d + 1)."""
-    return np.array(
-        [
-            [math.comb(j, m) / math.comb(degree, m) if m <= j else 0.0 for j in range(degree + 1)]
-            for m in range(degree + 1)
-        ]
-    )
+    orders = range(degree + 1)
+    return np.array([[math.comb(j, m) / math.comb(degree, m) for j in orders] for m in orders])
 
 
 def _within(degree: int, part: int, count: int) -> Floats:

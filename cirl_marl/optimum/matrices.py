@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -14,9 +13,10 @@ from cirl_marl.network import Floats, Integers, Network
 
 KEYS = 6
 """Whole numbers that say where a row comes."""
+NOW, BEFORE, LOOSER = range(3)
+"""What rows have entries of: their interval, the one before, and what scheduled arcs are asked for."""
 
 
-@dataclass(frozen=True)
 class Layout:
     """Where the variables of one interval lie: the column of the first of each kind, the others follow by position.
 
@@ -34,98 +34,56 @@ class Layout:
         degree: d.
         valves: nodes that have a Z.
         free_valves: nodes of these with scheduled outflows, on which the valve acts as well; v is then a variable.
+        moments: all Bernstein indices of an interval, piece after piece.
+        moment_column: the same as an array of shape (moments, 1), to be laid against nodes or arcs.
+        length: of a piece, δ.
+        portion: length of a piece over d + 1, the integral of each test polynomial.
+        stock: first of the weighted mean stocks X, then throughputs, of each moment, shape (moments,).
+        flow: first of the weighted mean flows F, likewise.
+        valve: first of Z, likewise.
+        end: first of the stocks at the end of each piece, shape (pieces,).
+        end_flow: first of the flows at the end of each piece, which stand behind the throughputs, likewise.
+        last: the stocks at the end of the interval.
+        level: first of the service levels.
+        imbalance: the variable that is at least |Δ·σ_env·f̄|; counted only with ``net_zero = "abs"``.
+        free_valve: first of the valves v themselves.
+        size: variables of an interval.
     """
 
-    network: Network
-    pieces: int
-    coarse: bool
-    has_end_flows: bool
-    degree: int
-    valves: Integers
-    free_valves: Integers
-
-    @cached_property
-    def moments(self) -> range:
-        """All Bernstein indices of an interval, piece after piece."""
-        return range(self.pieces * (self.degree + 1))
-
-    @cached_property
-    def moment_column(self) -> Integers:
-        """The same as an array of shape (moments, 1), to be laid against nodes or arcs."""
-        return np.arange(len(self.moments))[:, None]
-
-    @property
-    def length(self) -> float:
-        """Length of a piece, δ."""
-        return self.network.episode.control_interval / self.pieces
-
-    @property
-    def portion(self) -> float:
-        """Length of a piece over d + 1, the integral of each test polynomial."""
-        return self.network.episode.control_interval / len(self.moments)
-
-    @cached_property
-    def _block(self) -> int:
-        """Variables of a moment: X, F and Z."""
-        return len(self.network.nodes) + len(self.network.arcs) + len(self.valves)
-
-    @cached_property
-    def _piece(self) -> int:
-        """Variables of a piece: d + 1 blocks, then those about its end."""
-        ends = len(self.network.nodes) + len(self.network.arcs) if self.has_end_flows else len(self.network.stores)
-        return (self.degree + 1) * self._block + ends
-
-    @cached_property
-    def stock(self) -> Integers:
-        """First of the weighted mean stocks X, then throughputs, of each moment, shape (moments,)."""
-        piece, i = np.divmod(np.arange(len(self.moments)), self.degree + 1)
-        columns: Integers = piece * self._piece + i * self._block
-        return columns
-
-    @cached_property
-    def flow(self) -> Integers:
-        """First of the weighted mean flows F of each moment, shape (moments,)."""
-        return self.stock + len(self.network.nodes)
-
-    @cached_property
-    def valve(self) -> Integers:
-        """First of Z of each moment, shape (moments,)."""
-        return self.flow + len(self.network.arcs)
-
-    @cached_property
-    def end(self) -> Integers:
-        """First of the stocks at the end of each piece, shape (pieces,)."""
-        return np.arange(self.pieces) * self._piece + (self.degree + 1) * self._block
-
-    @cached_property
-    def end_flow(self) -> Integers:
-        """First of the flows at the end of each piece, which stand behind the throughputs, shape (pieces,)."""
-        return self.end + len(self.network.nodes)
-
-    @cached_property
-    def last(self) -> slice:
-        """The stocks at the end of the interval."""
-        return slice(int(self.end[-1]), int(self.end[-1]) + len(self.network.stores))
-
-    @property
-    def level(self) -> int:
-        """The first of the service levels."""
-        return self.pieces * self._piece
-
-    @property
-    def imbalance(self) -> int:
-        """The variable that is at least |Δ·σ_env·f̄|; counted only with ``net_zero = "abs"``."""
-        return self.level + len(self.network.services)
-
-    @property
-    def free_valve(self) -> int:
-        """The first of the valves v themselves."""
-        return self.imbalance + 1
-
-    @property
-    def size(self) -> int:
-        """Variables of an interval."""
-        return self.free_valve + len(self.free_valves)
+    def __init__(
+        self,
+        network: Network,
+        pieces: int,
+        degree: int,
+        valves: Integers,
+        free_valves: Integers,
+        *,
+        coarse: bool,
+        has_end_flows: bool = False,
+    ) -> None:
+        """Lay the variables out; the arguments are the attributes of the same names."""
+        self.network, self.pieces, self.degree = network, pieces, degree
+        self.valves, self.free_valves = valves, free_valves
+        self.coarse, self.has_end_flows = coarse, has_end_flows
+        self.moments = range(pieces * (degree + 1))
+        self.moment_column = np.arange(len(self.moments))[:, None]
+        self.length = network.episode.control_interval / pieces
+        self.portion = network.episode.control_interval / len(self.moments)
+        # a piece has d + 1 blocks of X, F and Z, then what is about its end
+        nodes, arcs = len(network.nodes), len(network.arcs)
+        block = nodes + arcs + len(valves)
+        piece_size = (degree + 1) * block + (nodes + arcs if has_end_flows else len(network.stores))
+        piece, i = np.divmod(np.arange(len(self.moments)), degree + 1)
+        self.stock: Integers = piece * piece_size + i * block
+        self.flow = self.stock + nodes
+        self.valve = self.flow + arcs
+        self.end = np.arange(pieces) * piece_size + (degree + 1) * block
+        self.end_flow = self.end + nodes
+        self.last = slice(int(self.end[-1]), int(self.end[-1]) + len(network.stores))
+        self.level = pieces * piece_size
+        self.imbalance = self.level + len(network.services)
+        self.free_valve = self.imbalance + 1
+        self.size = self.free_valve + len(free_valves)
 
     def means(self, plan: Floats) -> tuple[Floats, Floats, Floats]:
         """Return the plain means of X, F and Z over each interval, shape (steps, nodes | arcs | valves)."""
@@ -163,25 +121,22 @@ class ProgramRows:
         self._count += parts[0].size
         return numbers.reshape(parts[0].shape)
 
-    def put(self, rows: Integers, columns: ArrayLike, values: ArrayLike, *, before: bool = False) -> None:
-        """Put values into columns of the interval, or of the one before; entries at one place are added."""
-        self._put(before, rows, columns, values)
+    def put(self, rows: Integers, columns: ArrayLike, values: ArrayLike, *, part: int = NOW) -> None:
+        """Put values into columns of the interval, or of another ``part``; entries at one place are added."""
+        entries = np.broadcast_arrays(rows, np.asarray(columns, dtype=np.intp), np.asarray(values, dtype=float))
+        self._entries[part].append((entries[0].ravel(), entries[1].ravel(), entries[2].ravel()))
 
     def loosen(self, rows: Integers, arcs: ArrayLike, values: ArrayLike) -> None:
         """Allow rows so much more per unit of the most that scheduled arcs are asked for, where they may be cut."""
-        self._put(2, rows, arcs, values)
-
-    def _put(self, part: int, rows: Integers, columns: ArrayLike, values: ArrayLike) -> None:
-        entries = np.broadcast_arrays(rows, np.asarray(columns, dtype=np.intp), np.asarray(values, dtype=float))
-        self._entries[part].append((entries[0].ravel(), entries[1].ravel(), entries[2].ravel()))
+        self.put(rows, arcs, values, part=LOOSER)
 
     def at_start(self, rows: Integers, piece: ArrayLike, node: ArrayLike, values: ArrayLike) -> None:
         """Put values at the stocks of nodes at the start of pieces, the first of which is in the interval before."""
         parts = [np.ravel(part) for part in np.broadcast_arrays(rows, piece, node, values)]
-        for before, inside in ((False, parts[1] > 0), (True, parts[1] == 0)):
-            row, start, stock, value = (part[inside] for part in parts)
+        for part, inside in ((NOW, parts[1] > 0), (BEFORE, parts[1] == 0)):
+            row, start, stock, value = (values[inside] for values in parts)
             # piece 0 begins where the last piece of the interval before ends: end[0 − 1] there
-            self.put(row, self.layout.end[start - 1] + stock, value, before=before)
+            self.put(row, self.layout.end[start - 1] + stock, value, part=part)
 
     def limit(self, rows: Integers, values: ArrayLike) -> None:
         """Set the right-hand sides of rows; those of others are 0."""
@@ -219,22 +174,19 @@ class ChainedRows:
     def __init__(self, layout: Layout) -> None:
         """Begin without rows."""
         self._layout = layout
-        self._now: dict[int, Any] = {}
-        self._before: dict[int, Any] = {}
-        self._alone: dict[int, Any] = {}
-        self._looser: tuple[dict[int, Any], dict[int, Any]] = ({}, {})
+        self._links: dict[int, tuple[Any, Any, Any]] = {}
+        self._alone: dict[int, tuple[Any, Any, Any]] = {}
         self._cache: dict[bytes, tuple[Any, Any]] = {}
 
     def add(self, kind: int, links: ProgramRows, alone: ProgramRows) -> None:
         """Take the rows of a kind of interval: those that link it to the one before, and the others."""
-        self._now[kind], self._before[kind], self._looser[0][kind] = links.matrices()
-        self._now[kind].eliminate_zeros()
-        self._before[kind].eliminate_zeros()
-        self._alone[kind], _, self._looser[1][kind] = alone.matrices()
+        self._links[kind], self._alone[kind] = links.matrices(), alone.matrices()
+        for part in (NOW, BEFORE):
+            self._links[kind][part].eliminate_zeros()
 
     def at_start(self, kind: int) -> Any:
         """Return what the linked rows of a kind of interval have of the stocks at its start, (rows, stores), sparse."""
-        return self._before[kind][:, self._layout.last]
+        return self._links[kind][BEFORE][:, self._layout.last]
 
     def over(self, kinds: Integers, initial: Floats, cut: Floats) -> tuple[Any, Floats]:
         """Return the matrix over intervals of some kinds, and the right-hand side.
@@ -248,30 +200,28 @@ class ChainedRows:
         """
         key = kinds.tobytes()
         if key not in self._cache:
-            links, size = ((self._now, 0), (self._before, 1)), self._layout.size
-            looser = ((self._looser[0], 0),), ((self._looser[1], 0),)
-            matrix = self._over(kinds, size, links, ((self._alone, 0),))
-            self._cache[key] = matrix, self._over(kinds, cut.shape[1], *looser)
+            matrix = self._over(kinds, self._layout.size, (NOW, BEFORE))
+            self._cache[key] = matrix, self._over(kinds, cut.shape[1], (LOOSER,))
         # there is no interval before the first: its entries meet known stocks and go to the right-hand side
-        layout, (matrix, loosen), before = self._layout, self._cache[key], self._before[int(kinds[0])]
+        layout, (matrix, loosen), before = self._layout, self._cache[key], self._links[int(kinds[0])][BEFORE]
         first = np.zeros(layout.size)
         first[layout.last] = initial
         limits = loosen @ cut.ravel()
         limits[: before.shape[0]] -= before @ first
         return matrix, limits
 
-    def _over(self, kinds: Integers, size: int, *groups: tuple[tuple[dict[int, Any], int], ...]) -> Any:
-        """Lay blocks over intervals of ``size`` columns each, so many intervals before that of their rows."""
+    def _over(self, kinds: Integers, size: int, parts: tuple[int, ...]) -> Any:
+        """Lay some parts of the rows over intervals of ``size`` columns each."""
         entries, first = [], 0
-        for group in groups:
-            # the rows of a group stand one interval after the other, whatever kind each is of
-            tops = first + np.cumsum([0, *(group[0][0][kind].shape[0] for kind in kinds.tolist())])
+        for blocks in (self._links, self._alone):
+            # they stand one interval after the other, whatever kind each is of
+            tops = first + np.cumsum([0, *(blocks[kind][NOW].shape[0] for kind in kinds.tolist())])
             first = int(tops[-1])
-            for blocks, shift in group:
-                for kind in np.unique(kinds).tolist():
-                    steps = np.flatnonzero(kinds == kind)
-                    steps, block = steps[steps >= shift][:, None], blocks[kind].tocoo()
-                    rows, columns = tops[steps] + block.row, size * (steps - shift) + block.col
-                    entries.append((rows.ravel(), columns.ravel(), np.tile(block.data, len(steps))))
+            for part, kind in product(parts, np.unique(kinds).tolist()):
+                shift = int(part == BEFORE)
+                steps = np.flatnonzero(kinds == kind)
+                steps, block = steps[steps >= shift][:, None], blocks[kind][part].tocoo()
+                rows, columns = tops[steps] + block.row, size * (steps - shift) + block.col
+                entries.append((rows.ravel(), columns.ravel(), np.tile(block.data, len(steps))))
         rows, columns, values = (np.concatenate(part) for part in zip(*entries, strict=True))
         return sparse.csr_array((values, (rows, columns)), shape=(first, size * len(kinds)))

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,6 +26,7 @@ from cirl_marl.controllers.basic import Arrays, Planner
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, ControlError
 from cirl_marl.network import Floats
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.optimum.admissible import Admissible, NoCertificate, normalised_actions
 from cirl_marl.optimum.bounds import Bound, bound
 from cirl_marl.optimum.cross_entropy import KNOTS, Incumbent, search_each
@@ -40,25 +42,17 @@ BOUND = 0.3
 """About the share of solving for the bound in the work on a plan; the rest is to improve it."""
 
 
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """What is planned for one copy.
+    """What is planned for one copy."""
 
-    Attributes:
-        episode: of the copy, by its number.
-        intervals: of the episode.
-        problem: the program; None if nothing could be planned.
-        solution: its optimum, likewise.
-        actions: of the first intervals, shape (decisions, entries).
-        unit: what 1 of its objective is in the objective of plans that meet the demand.
-    """
-
-    episode: int
-    intervals: range
-    problem: Program | None
-    solution: Solution | None
-    actions: Floats
-    unit: float
+    episode: Annotated[int, "of the copy, by its number"]
+    intervals: Annotated[range, "of the episode"]
+    problem: Annotated[Program | None, "the program; None if nothing could be planned"]
+    solution: Annotated[Solution | None, "its optimum, likewise"]
+    actions: Annotated[Floats, "of the first intervals, shape (decisions, entries)"]
+    unit: Annotated[float, "what 1 of its objective is in the objective of plans that meet the demand"]
 
     def basis(self, intervals: range) -> Basis | None:
         """Return the basis from which to plan ``intervals``; None if they are neither as many nor the last of these."""

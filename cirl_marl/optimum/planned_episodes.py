@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Annotated, Protocol
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from cirl_marl.controllers.rollout import EVALUATION_SEEDS, Rollout, rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, ControlError
 from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.optimum.bounds import Bound
 
 SAME_START = 1e-9
@@ -104,24 +105,18 @@ def simulate_plan(bound: Bound) -> Rollout:
     return rollout(env, Plan(replace(bound, network=start_network)), start=start)
 
 
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class Episodes:
-    """What episodes were like, for each start and each copy that began there.
+    """What episodes were like, for each start and each copy that began there."""
 
-    Attributes:
-        circularity: λ̄, shape (starts, copies), mass.
-        service: mean service level, shape (starts, copies).
-        levels: mean level of each service, shape (services, starts, copies).
-        actions: normalised actions, shape (steps, entries, starts, copies).
-        deviation: mean between knots of what actions, once clipped, had beyond the controller's, shape
-            (starts, copies, knots, entries).
-    """
-
-    circularity: Floats
-    service: Floats
-    levels: Floats
-    actions: Floats
-    deviation: Floats
+    circularity: Annotated[Floats, "λ̄, shape (starts, copies), mass"]
+    service: Annotated[Floats, "mean service level, shape (starts, copies)"]
+    levels: Annotated[Floats, "mean level of each service, shape (services, starts, copies)"]
+    actions: Annotated[Floats, "normalised actions, shape (steps, entries, starts, copies)"]
+    deviation: Annotated[
+        Floats, "what clipped actions had beyond the controller's, mean between knots, (starts, copies, knots, entries)"
+    ]
 
 
 class Population:

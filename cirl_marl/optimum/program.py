@@ -6,14 +6,14 @@ flows weighted with B_i. Integration by parts and the flow laws hold for them ex
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import sparse
 
 from cirl_marl.network import Floats, Integers
+from cirl_marl.network.declarations import frozen_record
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.constraints import (
     balances,
@@ -35,40 +35,25 @@ LARGE = 30_000
 """Variables beyond which the substeps of an interval are merged, into one piece or, from degree 3 on, d − 1."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_record
 class LinearProgram:
-    """Minimise cᵀv subject to A v = b, G v ≤ g, l ≤ v ≤ u.
+    """Minimise cᵀv subject to A v = b, G v ≤ g, l ≤ v ≤ u."""
 
-    Attributes:
-        cost: c.
-        equal: A, sparse.
-        equal_to: b.
-        under: G, sparse.
-        under_to: g.
-        low: l.
-        high: u.
-    """
-
-    cost: Floats
-    equal: Any
-    equal_to: Floats
-    under: Any
-    under_to: Floats
-    low: Floats
-    high: Floats
+    cost: Annotated[Floats, "c"]
+    equal: Annotated[Any, "A, sparse"]
+    equal_to: Annotated[Floats, "b"]
+    under: Annotated[Any, "G, sparse"]
+    under_to: Annotated[Floats, "g"]
+    low: Annotated[Floats, "l"]
+    high: Annotated[Floats, "u"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_record
 class Program(LinearProgram):
-    """The program of an episode, or a part of it, with finite bounds l and u; v has shape (steps · layout.size,).
+    """The program of an episode, or a part of it, with finite bounds l and u; v has shape (steps · layout.size,)."""
 
-    Attributes:
-        layout: what v is.
-        constant: what no plan changes; the objective to maximise is −cᵀv + ``constant``.
-    """
-
-    layout: Layout
-    constant: float
+    layout: Annotated[Layout, "what v is"]
+    constant: Annotated[float, "what no plan changes; the objective to maximise is −cᵀv + ``constant``"]
 
     def interval_of_rows(self, matrix: Any) -> Integers:
         """Return the last interval whose variables each row of A or G is about, shape (rows,)."""
@@ -208,13 +193,14 @@ def _layout(admissible: Admissible, substeps: int, merge_pieces: bool | None, de
     movable = (admissible.valve[0] < admissible.valve[1]).any(axis=0)
     valves = np.flatnonzero(movable & ((exits > 1) | (exits > 0) & (schedules > 0)))
     free_valves = np.flatnonzero(movable & (exits > 0) & (schedules > 0))
-    fine = Layout(network, pieces, pieces < substeps, False, degree, valves, free_valves)
+    fine = Layout(network, pieces, degree, valves, free_valves, coarse=pieces < substeps)
     least_pieces = max(1, degree - 1)
     is_large = fine.size * network.episode.horizon > LARGE if merge_pieces is None else merge_pieces
     if pieces <= least_pieces or not is_large:
         return fine
-    coarse = replace(fine, pieces=least_pieces, coarse=True)
-    return replace(coarse, has_end_flows=bool(merge_pieces) or has_fast_stocks(admissible, coarse.length))
+    length = network.episode.control_interval / least_pieces
+    has_end_flows = bool(merge_pieces) or has_fast_stocks(admissible, length)
+    return Layout(network, least_pieces, degree, valves, free_valves, coarse=True, has_end_flows=has_end_flows)
 
 
 def _box(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from scipy.sparse.linalg import splu
 from cirl_marl.dynamics.laws import ArcRates
 from cirl_marl.dynamics.visit_bounds import VisitBounds
 from cirl_marl.network import Floats
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.optimum.admissible import Admissible, IntervalRanges, NoCertificate
 
 DENSE = 256
@@ -151,37 +152,27 @@ def _least_arrivals(shares: Any, arrivals: Floats, visits: Floats) -> Floats:
     return least
 
 
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class Reach:
-    """What the stocks can be.
+    """What the stocks can be."""
 
-    Attributes:
-        upper: bound of each stock within each interval, mass, and of what passes through each node that stores
-            nothing, mass/time, shape (steps, nodes).
-        uncut: whether the donor of each arc delivers all that is asked, whatever the actions, shape (steps, arcs).
-        inflow: most that enters each stock in each interval, shape (steps, stores), mass.
-    """
-
-    upper: Floats
-    uncut: NDArray[np.bool_]
-    inflow: Floats
+    upper: Annotated[
+        Floats, "most in each stock, mass, or through a node that stores nothing, mass/time, shape (steps, nodes)"
+    ]
+    uncut: Annotated[NDArray[np.bool_], "whether donors deliver all that is asked, whatever the actions, (steps, arcs)"]
+    inflow: Annotated[Floats, "most that enters each stock in each interval, shape (steps, stores), mass"]
 
 
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class DelayLine:
-    """What comes out of a fixed lifetime.
+    """What comes out of a fixed lifetime."""
 
-    Attributes:
-        arc: through which it comes out.
-        node: from which.
-        slots: what is in it at the start, first what comes out first, mass.
-        interval: length of an interval.
-    """
-
-    arc: int
-    node: int
-    slots: Floats
-    interval: float
+    arc: Annotated[int, "through which it comes out"]
+    node: Annotated[int, "from which"]
+    slots: Annotated[Floats, "what is in it at the start, first what comes out first, mass"]
+    interval: Annotated[float, "length of an interval"]
 
     def most(self, step: int, inflow: Floats) -> float:
         """Return the most that comes out in an interval, given the ``inflow`` in those before, mass/time."""

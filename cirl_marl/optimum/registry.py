@@ -36,25 +36,17 @@ def named_controller(
         raise CirlError(f"values of single agents go with {' or '.join(SETTABLE)} control, not with {name}")
     if min_service is not None and name not in ("mpc", "optimum"):
         raise CirlError(f"a demanded service level goes with mpc or optimum control, not with {name}")
+    if name in ("mpc", "optimum"):
+        # solvers are loaded by those who ask for them
+        from cirl_marl.optimum.mpc import MPC, SERVICE_FIRST, Optimum
+
+        planner: type[MPC | Optimum] = MPC if name == "mpc" else Optimum
+        return planner(min_service=min_service, service_weight=SERVICE_FIRST if min_service is None else None)
     makers: Mapping[str, Callable[[], Controller]] = {
         "neutral": Neutral,
         "constant": lambda: Constant(constants),
         "random": Random,
         "scripted": lambda: ScriptController(constants),
         "lqr": LQR,
-        "mpc": lambda: _mpc(min_service),
-        "optimum": lambda: _optimum(min_service),
     }
     return makers[name]()
-
-
-def _mpc(min_service: ArrayLike | None) -> Controller:
-    from cirl_marl.optimum.mpc import MPC, SERVICE_FIRST
-
-    return MPC(min_service=min_service, service_weight=SERVICE_FIRST if min_service is None else None)
-
-
-def _optimum(min_service: ArrayLike | None) -> Controller:
-    from cirl_marl.optimum.mpc import SERVICE_FIRST, Optimum
-
-    return Optimum(min_service=min_service, service_weight=SERVICE_FIRST if min_service is None else None)

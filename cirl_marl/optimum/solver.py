@@ -9,6 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
+from typing import Annotated
 
 import highspy
 import numpy as np
@@ -16,12 +17,11 @@ from scipy import sparse
 
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.optimum.admissible import NoCertificate
 from cirl_marl.optimum.certificate import Certificate, verify
 from cirl_marl.optimum.program import LinearProgram, Program
 
-STATUS = tuple(highspy.HighsBasisStatus(i) for i in range(len(highspy.HighsBasisStatus.__members__)))
-"""HiGHS's basis statuses by their numbers."""
 WARM_ITERATIONS = 2000
 """Simplex iterations from a given basis after which interior points, which need none, are the faster way."""
 PRIMAL = 4
@@ -68,17 +68,13 @@ class SolverFailure(NoCertificate):
     """A program that HiGHS does not solve, whatever is tried; the message says which, and how it ended."""
 
 
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class Basis:
-    """Which variables and rows are basic, and at which bound the others are; HiGHS completes one that is too small.
+    """Which variables and rows are basic, and at which bound the others are; HiGHS completes one that is too small."""
 
-    Attributes:
-        columns: status of each variable, as HiGHS counts them, shape (columns,).
-        rows: status of each row of A, then of G, shape (rows,).
-    """
-
-    columns: Integers
-    rows: Integers
+    columns: Annotated[Integers, "status of each variable, as HiGHS counts them, shape (columns,)"]
+    rows: Annotated[Integers, "status of each row of A, then of G, shape (rows,)"]
 
     def without_first(self, problem: Program, intervals: int) -> Basis:
         """Return what is left of the basis of ``problem`` for the program without its first ``intervals``."""
@@ -86,19 +82,14 @@ class Basis:
         return Basis(self.columns[intervals * problem.layout.size :], self.rows[rows >= intervals])
 
 
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """An optimum.
+    """An optimum."""
 
-    Attributes:
-        plan: the variables v.
-        certificate: the multipliers.
-        basis: from which a similar program may start; None if it was found without.
-    """
-
-    plan: Floats
-    certificate: Certificate
-    basis: Basis | None
+    plan: Annotated[Floats, "the variables v"]
+    certificate: Annotated[Certificate, "the multipliers"]
+    basis: Annotated[Basis | None, "from which a similar program may start; None if it was found without"]
 
 
 def solve(
@@ -146,9 +137,8 @@ def solve(
             answer, best = solution, distance
         if best <= (OPTIMAL if attempts is SETTINGS else NEAR):
             break
-    if (
-        answer is None and is_refused
-    ):  # presolve errs now and then, so the last settings, without it, have the last word
+    # presolve errs now and then, so the last settings, without it, have the last word
+    if answer is None and is_refused:
         raise Infeasible(f"network '{name}': HiGHS finds that nothing satisfies {label}")
     if answer is None or (certify and best > USABLE):
         lacks_hipo = len(problem.cost) >= LARGE_PROGRAM and not find_spec(EXTRA)
@@ -207,7 +197,11 @@ class _ScaledProgram:
             highs.setOptionValue(option, value)
         highs.passModel(self._model())
         if basis is not None:
-            highs.setBasis(_highs_basis(basis))
+            first = highspy.HighsBasis()
+            first.col_status = [highspy.HighsBasisStatus(status) for status in basis.columns.tolist()]
+            first.row_status = [highspy.HighsBasisStatus(status) for status in basis.rows.tolist()]
+            first.alien = first.valid = True
+            highs.setBasis(first)
             if primal:
                 highs.setOptionValue("simplex_strategy", PRIMAL)
             highs.setOptionValue("simplex_iteration_limit", WARM_ITERATIONS)
@@ -242,8 +236,8 @@ class _ScaledProgram:
         values, final, basis = highs.getSolution(), highs.getBasis(), None
         multipliers = np.array(values.row_dual) * self._row * self._scale
         if final.valid and highs.getModelStatus() == highspy.HighsModelStatus.kOptimal:
-            status = ([int(number) for number in part] for part in (final.col_status, final.row_status))
-            basis = Basis(*(np.array(number, dtype=np.intp) for number in status))
+            statuses = (final.col_status, final.row_status)
+            basis = Basis(*(np.array([int(status) for status in part], dtype=np.intp) for part in statuses))
         return Solution(
             plan=np.array(values.col_value) * self._size,
             certificate=Certificate(equal=multipliers[: self._equal], under=multipliers[self._equal :]),
@@ -257,12 +251,3 @@ class _ScaledProgram:
         proof = verify(problem, solution.certificate, solution.plan)
         # an objective near 0 is measured by the solver's tolerance on its largest term
         return abs(proof.bound - proof.objective) / max(abs(proof.bound), self._scale * FEASIBLE / OPTIMAL)
-
-
-def _highs_basis(basis: Basis) -> highspy.HighsBasis:
-    result = highspy.HighsBasis()
-    result.col_status = [STATUS[status] for status in basis.columns.tolist()]
-    result.row_status = [STATUS[status] for status in basis.rows.tolist()]
-    result.alien = True
-    result.valid = True
-    return result

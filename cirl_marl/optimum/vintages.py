@@ -19,8 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from scipy import sparse
@@ -29,6 +28,7 @@ from cirl_marl.dynamics.laws import ArcRates
 from cirl_marl.dynamics.stages import StagedNetwork, simulated_network, staged_network
 from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.network.elements import Node
 from cirl_marl.network.lifetimes import Chain
 from cirl_marl.optimum.kernels import Kernel, unit_outflow
@@ -38,31 +38,20 @@ LOOSE = 2e-4
 """Distance of the bounds of what leaves, relative to it, above which intervals have more pieces."""
 
 
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class PassiveLifetime:
-    """A lifetime that nobody controls.
+    """A lifetime that nobody controls."""
 
-    Attributes:
-        node: whose it is.
-        rows: of its stages, or slots, among the stocks of the simulator.
-        leaving: the arc of the planned network through which what has lived goes.
-        entering: its arcs through which something enters.
-        rate: μ in each interval, shape (steps,), 1/time; empty for a fixed one.
-        at_once: w_0, part of what enters that leaves at once.
-        reached_node: the node, or its last stage, among the nodes of ``reached``.
-        reached_entry: where what enters is among them; the node itself of a fixed one.
-        reached_arc: ``leaving`` among its arcs.
-    """
-
-    node: Node
-    rows: Integers
-    exit_arc: int
-    inflow_arcs: Integers
-    rate: Floats
-    at_once: float
-    reached_node: int
-    reached_entry: int
-    reached_arc: int
+    node: Annotated[Node, "whose it is"]
+    rows: Annotated[Integers, "of its stages, or slots, among the stocks of the simulator"]
+    exit_arc: Annotated[int, "the arc of the planned network through which what has lived goes"]
+    inflow_arcs: Annotated[Integers, "its arcs through which something enters"]
+    rate: Annotated[Floats, "μ in each interval, shape (steps,), 1/time; empty for a fixed one"]
+    at_once: Annotated[float, "w_0, part of what enters that leaves at once"]
+    reached_node: Annotated[int, "the node, or its last stage, among the nodes of ``reached``"]
+    reached_entry: Annotated[int, "where what enters is among them; the node itself of a fixed one"]
+    reached_arc: Annotated[int, "``leaving`` among its arcs"]
 
     @property
     def chain(self) -> Chain:
@@ -87,6 +76,12 @@ class Lifetimes:
         plan_network: as the program has it.
         reach_network: as stocks are bounded, all lifetimes but fixed ones being chains.
         passive: the lifetimes that nobody controls.
+        exit_arcs: arcs of the planned network that come out of these.
+        start_planned: what the stores of the planned network hold of the stocks of the simulator, (stores, stocks).
+        start_reached: what the stores of ``reach_network`` hold of them, likewise.
+        nodes_reached: what the nodes of the planned network are of those of ``reach_network``, shape (nodes, nodes).
+        arcs_reached: arcs of ``reach_network`` that are those of the planned network, shape (arcs,).
+        totals: what the stocks of the network are of those of the planned one, shape (stores, stores).
     """
 
     def __init__(self, network: Network, agents: Sequence[str]) -> None:
@@ -97,15 +92,15 @@ class Lifetimes:
         self.passive: list[PassiveLifetime] = []
         self._kernels: dict[tuple[str, bytes, int, int], Kernel] = {}
         nodes = [node for node in network.stores if node.lifetime is not None]
-        if not nodes:
-            return
         whole = [node for node in nodes if not (node.id in agents and node.control is not None)]
-        fixed_nodes = [node.id for node in whole if node.lifetime is not None and node.lifetime.chain is None]
-        plan_network = self.plan_network = staged_network(network, {node.id for node in whole})
-        reach_network = self.reach_network = staged_network(network, fixed_nodes)
+        if nodes:
+            fixed_nodes = [node.id for node in whole if node.lifetime is not None and node.lifetime.chain is None]
+            self.plan_network = staged_network(network, {node.id for node in whole})
+            self.reach_network = staged_network(network, fixed_nodes)
+        plan_network, reach_network = self.plan_network, self.reach_network
         neutral = network.control_bounds[1]
         for node in whole:
-            assert node.lifetime is not None
+            assert isinstance(plan_network, StagedNetwork) and node.lifetime is not None
             place, chain, rate = network.node_index[node.id], node.lifetime.chain, np.zeros(0)
             if chain is not None:
                 rate = chain.rate / node.lifetime.mean / network.interval_means(node.stretch)
@@ -124,11 +119,13 @@ class Lifetimes:
                     reached_arc=reach_network.arc_index[plan_network.release_arcs[node.id]],
                 )
             )
-
-    @cached_property
-    def exit_arcs(self) -> Integers:
-        """Arcs of the planned network that come out of lifetimes that nobody controls."""
-        return np.array([lifetime.exit_arc for lifetime in self.passive], dtype=np.intp)
+        self.exit_arcs = np.array([lifetime.exit_arc for lifetime in self.passive], dtype=np.intp)
+        stocks = self.state_layout.nodes.stop
+        self.start_planned = _sums(self.simulator_network, plan_network)[: len(plan_network.stores), :stocks]
+        self.start_reached = _sums(self.simulator_network, reach_network)[: len(reach_network.stores), :stocks]
+        self.nodes_reached = _sums(reach_network, plan_network)
+        self.arcs_reached = np.array([reach_network.arc_index[arc.id] for arc in plan_network.arcs], dtype=np.intp)
+        self.totals = _sums(plan_network, network)[: len(network.stores), : len(plan_network.stores)]
 
     def pieces(self, degree: int, most: int) -> int:
         """Return the pieces of an interval, at most ``most``, in which stocks turn over once and kernels are smooth."""
@@ -148,34 +145,6 @@ class Lifetimes:
         kernel = Kernel(lifetime.chain, rate, self.network.episode.control_interval / pieces, degree)
         low, high = (bound[-1].sum(axis=(1, 2)) for bound in (kernel.low, kernel.high))
         return float(((high - low) / high).max())
-
-    @cached_property
-    def start_planned(self) -> Any:
-        """What the stores of the planned network hold of the stocks of the simulator, shape (stores, stocks)."""
-        return self._start_of(self.plan_network)
-
-    @cached_property
-    def start_reached(self) -> Any:
-        """What the stores of ``reach_network`` hold of them, shape (stores, stocks)."""
-        return self._start_of(self.reach_network)
-
-    def _start_of(self, network: Network) -> Any:
-        return _sums(self.simulator_network, network)[: len(network.stores), : self.state_layout.nodes.stop]
-
-    @cached_property
-    def nodes_reached(self) -> Any:
-        """What the nodes of the planned network are of those of ``reach_network``, shape (nodes, nodes)."""
-        return _sums(self.reach_network, self.plan_network)
-
-    @cached_property
-    def arcs_reached(self) -> Integers:
-        """Arcs of ``reach_network`` that are those of the planned network, shape (arcs,)."""
-        return np.array([self.reach_network.arc_index[arc.id] for arc in self.plan_network.arcs], dtype=np.intp)
-
-    @cached_property
-    def totals(self) -> Any:
-        """What the stocks of the network are of those of the planned one, shape (stores, stores)."""
-        return _sums(self.plan_network, self.network)[: len(self.network.stores), : len(self.plan_network.stores)]
 
     def rows(self, layout: Layout, initial: Floats, intervals: range) -> tuple[Any, Floats]:
         """Return the rows G v ≤ g of all lifetimes that nobody controls, and g.
