@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 from cirl_marl.definitions.reader import Definition
 from cirl_marl.errors import DefinitionError
 from cirl_marl.network import Network
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 
 TABLES = ("nodes", "arcs", "services")
 SETTINGS = ("scales", "episode", "objective")
@@ -17,8 +16,7 @@ ENDS = ("value", "low", "neutral", "high")
 """What a quantity, a range and the span of a control consist of."""
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class StatedNumber:
     """A number as its definition states it."""
 

@@ -5,39 +5,29 @@ from __future__ import annotations
 import math
 import re
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError
+from cirl_marl.network.declarations import frozen_record
 from cirl_marl.records.files import write_atomically
 
 TEMPLATE = Path(__file__).with_name("first_cycle.template")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_record
 class FirstCycle:
-    """What a first definition is made of.
+    """What a first definition is made of."""
 
-    Attributes:
-        material: what flows, in words.
-        mass: unit of mass, such as ``kt``.
-        in_use: mass that is in use at the start.
-        lifetime: mean years that it stays in use.
-        recycled: share of the discards that is recycled today.
-        growth: of what is in use, in percent a year.
-        start: first year.
-        years: that the episode lasts.
-    """
-
-    material: str
-    mass: str
-    in_use: float
-    lifetime: float
-    recycled: float
-    growth: float = 0.0
-    start: int = 2025
-    years: int = 25
+    material: Annotated[str, "what flows, in words"]
+    mass: Annotated[str, "unit of mass, such as ``kt``"]
+    in_use: Annotated[float, "mass that is in use at the start"]
+    lifetime: Annotated[float, "mean years that it stays in use"]
+    recycled: Annotated[float, "share of the discards that is recycled today"]
+    growth: Annotated[float, "of what is in use, in percent a year"] = 0.0
+    start: Annotated[int, "first year"] = 2025
+    years: Annotated[int, "that the episode lasts"] = 25
 
     def __post_init__(self) -> None:
         """Raise a ``CirlError`` for numbers that cannot be meant."""

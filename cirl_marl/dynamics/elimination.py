@@ -8,20 +8,18 @@ over all of them and all copies, so a column's bits do not depend on the batch i
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 
 from cirl_marl.network import Floats, Integers, RowSum
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 
 COSTLY = 2
 """A round eliminates nodes that are at most this many times as costly as the cheapest."""
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class _Round:
     """Nodes that are eliminated together, and the shares of theirs that are left then."""
 

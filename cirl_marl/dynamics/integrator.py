@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Annotated
 
@@ -17,7 +16,7 @@ from cirl_marl.dynamics.stages import FixedLifetimes, StagedNetwork
 from cirl_marl.dynamics.taylor import Taylor
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Law
 from cirl_marl.network.rowsum import RowSum, disposable
 
@@ -28,8 +27,7 @@ RUNGE_KUTTA = {"rk4": ((0.0, 0.5, 0.5, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6)), "eul
 """Nodes and weights of the explicit schemes; each stage starts from the slope of the one before."""
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Transition:
     """What one control interval did."""
 

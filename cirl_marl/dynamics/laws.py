@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -26,7 +25,7 @@ from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.dynamics.uncertain_factors import FlowFactors
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import MAX_STEPS, Arc, ControlKind, Law
 from cirl_marl.network.rowsum import RowSum, single_column
 from cirl_marl.network.series import Series, Value
@@ -38,8 +37,7 @@ SCALING = (ControlKind.RATE, FLOW, ControlKind.STRETCH)
 """Kinds of controls that are factors of flows, a stretch by its inverse."""
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class FlowLaw:
     """One law, f = r·y[driver]."""
 

@@ -11,7 +11,6 @@ arcs and of the detours through constant nodes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -21,12 +20,11 @@ from cirl_marl.dynamics.elimination import EliminatedShares
 from cirl_marl.dynamics.static_elimination import SparseRow, StaticElimination, square_matrix
 from cirl_marl.dynamics.visit_bounds import VisitBounds
 from cirl_marl.network import Floats, Integers, Network, RowSum
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.split_fractions import splits
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class IntervalRoutes:
     """The shares of one control interval, in each copy."""
 

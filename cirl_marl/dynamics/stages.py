@@ -33,7 +33,7 @@ class StagedNetwork(Network):
         stages: by node with a lifetime its stores here, first the one that what enters takes longest to leave; a single
             one where the lifetime is not written out.
         valves: by store the node whose control of kind ``stretch`` acts on what leaves it.
-        leaving: by node with a lifetime the arc through which what has lived goes to the node that shares it out.
+        release_arcs: by node with a lifetime the arc through which what has lived goes to the node that shares it out.
         parts: by node that only is here the one that it is a part of.
     """
 
@@ -78,7 +78,7 @@ class StagedNetwork(Network):
 
     @property
     def lines(self) -> Mapping[str, str]:
-        """The part of ``leaving`` that comes out of slots."""
+        """The part of ``release_arcs`` that comes out of slots."""
         arcs = {arc.id: arc for arc in self.arcs}
         with_stages = {node: arc for node, arc in self.release_arcs.items() if len(self.stages[node]) > 1}
         return {node: arc for node, arc in with_stages.items() if arcs[arc].law is Law.EXOGENOUS}
@@ -87,7 +87,7 @@ class StagedNetwork(Network):
 def staged_network(network: Network, whole: Container[str] = ()) -> StagedNetwork:
     """Return ``network`` with its lifetimes as chains and lines.
 
-    Of nodes that stay ``whole`` the arc ``leaving`` alone is written, with the rate of the stages, or 1 for a line:
+    Of nodes that stay ``whole`` the release arc alone is written, with the rate of the stages, or 1 for a line:
     what it carries does not follow from the stock.
     """
     with_lifetime = [node for node in network.stores if node.lifetime is not None]

@@ -8,21 +8,19 @@ second array.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 
 from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Law, Role
 from cirl_marl.network.rowsum import RowSum, spans
 from cirl_marl.network.series import extremes
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class BatchLine:
     """One batch arc and its rows."""
 

@@ -8,7 +8,6 @@ v = 1 + max_s P(s) v, by policy iteration (Howard 1960).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -16,7 +15,7 @@ from scipy import sparse
 
 from cirl_marl.errors import NetworkError
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.split_fractions import Split
 
 MOST_ROUNDS = 100
@@ -25,8 +24,7 @@ SLACK = 1e-8
 """Relative widening that makes up for what the solution of the linear systems leaves open."""
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class _Alike:
     """Splits of as many controlled arcs and as many others, whose choices are made together."""
 

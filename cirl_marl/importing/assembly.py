@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +17,7 @@ from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.importing.balances import Change, Processes, ProcessKind, Residual
 from cirl_marl.importing.definition import ImportedFiles, definition_files, identifiers
 from cirl_marl.importing.flow_table import FlowTable, read_flows, read_stocks
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Role
 from cirl_marl.records.files import publish_folder, write_table
 
@@ -31,8 +30,7 @@ Ask = Callable[[str, ProcessKind], Role]
 """Returns the role of a source or a sink."""
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class ImportReport:
     """What an import found and wrote."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import StrEnum
 from typing import Annotated
 
@@ -12,7 +12,7 @@ import numpy as np
 from cirl_marl.errors import CirlError
 from cirl_marl.importing.flow_table import Connection, FlowTable
 from cirl_marl.network import Floats
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 
 ROUNDING = 1e-6
 """Part of the largest flow of a region by which a process may fail to balance, as tables are rounded."""
@@ -32,8 +32,7 @@ class ProcessKind(StrEnum):
     STORE = "store"
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Residual:
     """What entered a process and did not leave it, though it is no store."""
 
@@ -49,8 +48,7 @@ class Residual:
         return f"'{self.process}' ({place}): {self.inflow:g} enter, {self.outflow:g} leave"
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Change:
     """A flow that was adjusted."""
 

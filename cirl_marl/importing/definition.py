@@ -6,7 +6,6 @@ import json
 import re
 import unicodedata
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -14,12 +13,11 @@ import numpy as np
 from cirl_marl.importing.balances import Processes, ProcessKind
 from cirl_marl.importing.flow_table import Connection, FlowTable
 from cirl_marl.network import Floats
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Role
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class ImportedFiles:
     """The files of an imported network."""
 

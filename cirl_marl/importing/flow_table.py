@@ -11,7 +11,7 @@ from typing import Annotated
 from zipfile import BadZipFile
 
 from cirl_marl.errors import CirlError, unknown_name
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.units import factor
 
 NAMES: Mapping[str, tuple[str, ...]] = {
@@ -42,8 +42,7 @@ class Connection:
         return f"'{self.source}' to '{self.target}'" + (f", {self.type}" if self.type else "")
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class FlowTable:
     """Flows by region, year and pair; what is not in ``flows`` is 0."""
 

@@ -68,8 +68,7 @@ class TimeDependent:
         raise NotImplementedError
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Declaration:
     """What is known of a field; by itself, of a text, of ids in a fixed order, or of one that is true or false."""
 
@@ -83,8 +82,7 @@ class Declaration:
         return ""
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Word(Declaration):
     """One of some words."""
 
@@ -104,8 +102,7 @@ SMALLEST, LARGEST = 1e-50, 1e50
 """Sizes of numbers of which squares and quotients are finite."""
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Quantity(Declaration):
     """A number with a unit."""
 
@@ -151,8 +148,7 @@ NotNegative = partial(Quantity, low=0.0)
 Share = partial(Quantity, low=0.0, high=1.0)
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Numbers(Declaration):
     """Several numbers, which definition files spell in a table of their own."""
 

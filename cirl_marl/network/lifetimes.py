@@ -12,7 +12,6 @@ distribution, 0 for n = 0). w is found by non-negative least squares, μ and K b
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import cache
 from typing import Annotated
 
@@ -20,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.rowsum import Floats
 
 CLOSE = 2e-3
@@ -79,8 +78,7 @@ flow analysis; of a normal one what is below 0 leaves at once.
 """
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Chain:
     """The stages of a lifetime with parameter ``mean`` 1."""
 

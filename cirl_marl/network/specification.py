@@ -29,7 +29,7 @@ class Specification:
         objective: circularity and rewards.
         observation: default observation.
         uncertain: how numbers spread that are not known exactly, by their path, such as ``arcs.mining.rate``.
-        acting: compartments that act by default; empty means every compartment with a control.
+        default_agents: compartments that act by default; empty means every compartment with a control.
         mass_unit: unit of stocks.
         time_unit: unit of time.
         title: one line for tables.

@@ -12,13 +12,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Law
 from cirl_marl.network.rowsum import Floats, Integers, single_column
 from cirl_marl.network.series import Series
@@ -32,8 +31,7 @@ SUMS = 1e-6
 """Distance from 1 at which given shares count as summing to it; they are then scaled to do so."""
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Split:
     """The arcs that share what leaves one node; where nothing changes its tables are views of one column."""
 
