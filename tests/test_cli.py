@@ -63,7 +63,10 @@ def test_networks_and_show(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     assert run(monkeypatch, "networks") == 0
     listed = capsys.readouterr().out
     assert cirl_marl.load_network("copper_net").title.endswith("collection draws on copper in use, not on discards")
-    assert all(word in listed for word in ("copper_net", "carbo_net", "independent_ppo"))
+    assert all(word in listed for word in ("copper_net", "steel_* (30 regions)", "Solids: a", "independent_ppo"))
+    assert run(monkeypatch, "networks", "--all") == 0
+    listed = capsys.readouterr().out
+    assert all(name in listed for name in cirl_marl.networks())
     assert run(monkeypatch, "show", "copper_net") == 0
     shown = capsys.readouterr().out
     assert "λ of the start state: -93.6 kt" in shown

@@ -123,6 +123,8 @@ def test_import_is_light() -> None:
 TRAINERS = {"torch", "stable_baselines3", "mujoco", "matplotlib", "SALib", "pandas"}
 SIMULATOR = {"scipy", "pint", "pydantic", "tomlkit", "cirl_marl.network", "cirl_marl.dynamics"}
 
+BUILDERS = {"pint", "scipy.integrate", "scipy.optimize", "gymnasium_robotics"}
+
 
 @pytest.mark.parametrize(
     ("arguments", "absent"),
@@ -130,7 +132,7 @@ SIMULATOR = {"scipy", "pint", "pydantic", "tomlkit", "cirl_marl.network", "cirl_
         (["-c", "import cirl_marl"], TRAINERS | SIMULATOR | {"typer", "rich", "pettingzoo"}),
         (["-m", "cirl_marl.cli", "--help"], TRAINERS | SIMULATOR | {"pettingzoo"}),
         (["-m", "cirl_marl.cli", "--version"], TRAINERS | SIMULATOR | {"pettingzoo"}),
-        (["-m", "cirl_marl.cli", "networks"], TRAINERS - {"mujoco"} | {"cirl_marl.dynamics", "cirl_marl.optimum"}),
+        (["-m", "cirl_marl.cli", "networks"], TRAINERS | BUILDERS | {"cirl_marl.dynamics", "cirl_marl.optimum"}),
         (["-m", "cirl_marl.cli", "check", "copper_net"], TRAINERS | {"pettingzoo", "cirl_marl.optimum"}),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",

@@ -30,18 +30,16 @@ if TYPE_CHECKING:
 
 
 @app.command("networks", rich_help_panel=NETWORKS)
-def list_networks() -> None:
+def list_networks(
+    every: Annotated[
+        bool, typer.Option("--all", help="A row for each region of a definition that has regions.")
+    ] = False,
+) -> None:
     """List the networks and the learner recipes of the catalogue."""
-    from cirl_marl.definitions.catalogue import families, load_network, recipes
+    from cirl_marl.definitions.catalogue import definitions, recipes
     from cirl_marl.report.terminal import networks_table
 
-    networks, names_by_family = {}, families()
-    with bar("reading") as progress:
-        for i, (family, names) in enumerate(names_by_family.items()):
-            label = f"{family}_{{{', '.join(name.removeprefix(f'{family}_') for name in names)}}}"
-            networks[names[0] if len(names) == 1 else label] = load_network(names[0])
-            progress((i + 1) / len(names_by_family))
-    console.print(networks_table(networks))
+    console.print(networks_table(definitions(), every=every))
     console.print(f"recipes for --recipe: {', '.join(recipes())}")
 
 
@@ -213,18 +211,17 @@ def _check_network(source: str, progress: Callable[[float], None]) -> None:
     network = load_network(source)
     assert network.source is not None
     definition(network.source).check(network.region)
+    remarks: list[str] = []
     for i, variant in enumerate((network, *network.scenarios.values()), start=1):
-        try:
-            MultiAgentVectorEnv(
-                variant, num_envs=1
-            )  # finds what only a network that is run says, as rates no solver can follow
-            progress(i / (1 + len(network.scenarios)))
+        try:  # finds what only a network that is run says, as rates no solver can follow
+            env = MultiAgentVectorEnv(variant, num_envs=1)
         except CirlError as error:
             raise CirlError(f"{source}, scenario '{variant.scenario_name}': {error}") from error
+        remarks += (f"scenario '{variant.scenario_name}': {remark}" for remark in lint_warnings(variant, env))
+        progress(i / (1 + len(network.scenarios)))
     say(
         f"{source}: {len(network.compartments)} compartments, {len(network.agents)} agents, "
         f"scenarios {', '.join([network.scenario_name, *network.scenarios])}: no mistakes"
     )
-    for variant in (network, *network.scenarios.values()):
-        for remark in lint_warnings(variant):
-            say(f"{source}: remark on scenario '{variant.scenario_name}': {remark}")
+    for remark in remarks:
+        say(f"{source}: remark on {remark}")

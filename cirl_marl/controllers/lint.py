@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache, partial
 
 import numpy as np
 
-from cirl_marl.controllers.basic import Constant, Neutral
-from cirl_marl.controllers.rollout import episode_start, rollout
+from cirl_marl.controllers.basic import Constant, Controller, Neutral
+from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
 from cirl_marl.controllers.shortages import service_shortages, shortages
 from cirl_marl.dynamics.laws import LAWS
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.compartment_model import ReleasingModel
-from cirl_marl.network.elements import ControlKind, Law, Role
+from cirl_marl.network.elements import Arc, ControlKind, Law, Role
 from cirl_marl.network.lifetimes import CLOSE
 from cirl_marl.network.series import Series, extremes
 from cirl_marl.network.units import factor
@@ -31,22 +32,21 @@ SHORT = 20
 """Control intervals over which the ends of the controls are tried."""
 
 
-def lint_warnings(network: Network) -> Iterator[str]:
-    """Yield what whoever wrote ``network`` may not have meant: what is idle, starved, too late or too coarse."""
-    for look in (
-        _apart,
-        _without_effect,
-        _shares,
-        _departures,
-        _free,
-        _short_flows,
-        _short_services,
-        _aimless,
-        _unpaid,
-        _coarse,
-        _lives,
-    ):
+def lint_warnings(network: Network, env: MultiAgentVectorEnv | None = None) -> Iterator[str]:
+    """Yield what whoever wrote ``network`` may not have meant: what is idle, starved, too late or too coarse.
+
+    ``env`` is one copy of it; None makes one.
+    """
+    env = MultiAgentVectorEnv(network, num_envs=1) if env is None else env
+    for look in (_apart, _without_effect, _shares, _departures, _free):
         yield from look(network)
+    neutral = cache(partial(_episode, env, Neutral()))
+    yield from _short_flows(env, neutral)
+    yield from _short_services(env, neutral)
+    for look in (_aimless, _unpaid):
+        yield from look(network)
+    yield from _coarse(env)
+    yield from _lives(network)
 
 
 def _apart(network: Network) -> Iterator[str]:
@@ -78,10 +78,14 @@ def _shares(network: Network) -> Iterator[str]:
     A valve v on a flow whose share is s at v = 1 makes it the share v·s/(1 + (v − 1)·s), not v·s. Where every flow has
     a valve, they set what passes, and no share is meant.
     """
+    exits: dict[str, list[Arc]] = {}
+    for arc in network.arcs:
+        if arc.law is Law.DONOR:
+            exits.setdefault(arc.donor, []).append(arc)
     for node in network.nodes:
-        split = {arc.id: arc for arc in network.arcs if arc.donor == node.id and arc.law is Law.DONOR}
-        rates = {arc.id: float(network.interval_means(arc.rate)[0]) for arc in split.values()}
-        valves = [(arc, arc.control) for arc in split.values() if arc.control is not None]
+        split = exits.get(node.id, [])
+        rates = {arc.id: float(network.interval_means(arc.rate)[0]) for arc in split}
+        valves = [(arc, arc.control) for arc in split if arc.control is not None]
         for arc, control in valves if len(valves) < sum(rate > 0 for rate in rates.values()) else ():
             share = rates[arc.id] / sum(rates.values())
             ends = [
@@ -115,23 +119,23 @@ def _departures(network: Network) -> Iterator[str]:
                 yield f"{at}: {mass:g} {network.mass_unit} are no whole number of {sizes}"
 
 
-def _coarse(network: Network) -> Iterator[str]:
+def _coarse(env: MultiAgentVectorEnv) -> Iterator[str]:
     """Yield what neutral control brings about otherwise with half the solver's step, and controls it cannot follow."""
-    step = network.episode.solver_step
+    network, step = env.network, env.network.episode.solver_step
     if step is None:
         return
     try:
         for action in (-1.0, 1.0):
-            _states(network, action, SHORT)
-        finer = network.with_options(episode={"solver_step": step / 2})
-        trajectories = [_states(variant, None, INTERVALS) for variant in (network, finer)]
+            _states(env, action, SHORT)
+        finer = MultiAgentVectorEnv(network.with_options(episode={"solver_step": step / 2}), num_envs=1)
+        trajectories = [_states(variant, None, INTERVALS) for variant in (env, finer)]
     except CirlError as error:
         yield str(error)
         return
     size = np.maximum(np.abs(trajectories[1]).max(axis=0), 1e-9)
     apart = np.abs(trajectories[0] - trajectories[1]).max(axis=0) / size
     if apart[worst := int(apart.argmax())] > COARSE:
-        name = MultiAgentVectorEnv(network, num_envs=1).state_names[worst]
+        name = env.state_names[worst]
         change = f"neutral control gives another {name}, by {apart[worst]:.0%} of its largest value; take a shorter one"
         yield f"episode.solver_step {step:g} {network.time_unit} is long: with half of it, {change}"
 
@@ -148,17 +152,16 @@ def _lives(network: Network) -> Iterator[str]:
             )
 
 
-def _states(network: Network, action: float | None, intervals: int) -> Floats:
+def _states(env: MultiAgentVectorEnv, action: float | None, intervals: int) -> Floats:
     """Return the states that come of one action of all agents, None being neutral, shape (intervals, states)."""
-    env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(seed=0)
     controls = env.dynamics.neutral.copy()
     if action is not None:
-        rows = [row for agent in env.agents for row in range(len(controls))[network.control_rows[agent]]]
+        rows = [row for agent in env.agents for row in range(len(controls))[env.network.control_rows[agent]]]
         controls[rows] = (env.dynamics.control_low if action < 0 else env.dynamics.control_high)[rows]
     state, trajectory = env.physical, []
     with np.errstate(all="ignore"):
-        for step in range(min(network.episode.horizon, intervals)):
+        for step in range(min(env.network.episode.horizon, intervals)):
             after = env.dynamics.advance(state.stock, state.inner, controls[:, [step]], np.array([step]))
             state = replace(state, stock=after.stock, inner=after.inner)
             whole = env.rows.start_of(after.stock, after.inner)
@@ -176,28 +179,32 @@ def _free(network: Network) -> Iterator[str]:
             yield f"node '{node.id}': nothing enters it, and what it delivers counts nothing in λ; {remedy}"
 
 
-def _short_flows(network: Network) -> Iterator[str]:
+def _short_flows(env: MultiAgentVectorEnv, neutral: Callable[[], Rollout]) -> Iterator[str]:
     """Yield scheduled flows that run short: under neutral control, and from sources whose controls are at the highest.
 
     A source is a donor that nothing enters. That agents can empty others is no fault of the network.
     """
+    network = env.network
     scheduled_donors = {arc.id: arc.donor for arc in network.arcs if LAWS[arc.law].is_scheduled}
     if not scheduled_donors:
         return
+    if network.episode.horizon > INTERVALS:
+        env = MultiAgentVectorEnv(network, num_envs=1, horizon=INTERVALS)
+        neutral = partial(_episode, env, Neutral())
     recipients = {arc.recipient for arc in network.arcs}
     sources = {id_ for arc, donor in scheduled_donors.items() if donor not in recipients for id_ in (arc, donor)}
-    highest = Constant({agent: 1.0 for agent in network.agents if agent in sources and _scales(network, agent)})
-    env = MultiAgentVectorEnv(network, num_envs=1, horizon=min(network.episode.horizon, INTERVALS))
+    highest = {agent: 1.0 for agent in network.agents if agent in sources and _scales(network, agent)}
     reported: set[str] = set()
-    origin = episode_start(env)
-    checks = (("neutral", Neutral(), set(scheduled_donors)), ("the highest", highest, sources))
-    for control, controller, looked_at in checks:
+    checks = [("neutral", neutral, set(scheduled_donors))]
+    if highest:
+        checks.append(("the highest", partial(_episode, env, Constant(highest)), sources))
+    for control, run, looked_at in checks:
         try:
-            run = rollout(env, controller, seed=origin.seed, start=origin.initial_state)
+            shortages_ = list(shortages(run(), env.network))
         except CirlError as error:
             yield str(error)
             return
-        for short in shortages(run, env.network):
+        for short in shortages_:
             arc, since = short.arc, f"from {short.begins:g} {network.time_unit} on"
             if arc.id in looked_at - reported:
                 reported.add(arc.id)
@@ -205,14 +212,18 @@ def _short_flows(network: Network) -> Iterator[str]:
                 yield f"arc '{arc.id}': {little}; give it a larger initial stock if it stands for the world outside"
 
 
-def _short_services(network: Network) -> Iterator[str]:
+def _short_services(env: MultiAgentVectorEnv, neutral: Callable[[], Rollout]) -> Iterator[str]:
     """Yield services that fall short of what is demanded though arcs make up for them."""
-    if not any(arc.makes_up_for for arc in network.arcs):
+    if not any(arc.makes_up_for for arc in env.network.arcs):
         return
-    env = MultiAgentVectorEnv(network, num_envs=1)
-    origin = episode_start(env)
-    for shortage in service_shortages(rollout(env, Neutral(), seed=origin.seed, start=origin.initial_state), network):
+    for shortage in service_shortages(neutral(), env.network):
         yield f"under neutral control {shortage}; widen the bounds of its control, or ask for less"
+
+
+def _episode(env: MultiAgentVectorEnv, controller: Controller) -> Rollout:
+    """Return the episode from the middle of the initial ranges."""
+    origin = episode_start(env)
+    return rollout(env, controller, seed=origin.seed, start=origin.initial_state)
 
 
 def _scales(network: Network, id_: str) -> bool:

@@ -40,7 +40,12 @@ def networks() -> list[str]:
 
 def families() -> dict[str, list[str]]:
     """Return the names of the networks of each definition of the catalogue, by the name of the definition."""
-    return {path.stem: [*_regions(path)] for path in sorted(folder("envs").glob("*.toml"))}
+    return {name: [*_regions(definition_.path)] for name, definition_ in definitions().items()}
+
+
+def definitions() -> dict[str, Definition]:
+    """Return the definitions of the catalogue, by name."""
+    return {path.stem: definition(path) for path in sorted(folder("envs").glob("*.toml"))}
 
 
 def recipes() -> list[str]:

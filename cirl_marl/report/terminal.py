@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from cirl_marl.definitions.conversion import REGION
+from cirl_marl.definitions.reader import Definition
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Lifetime
 
@@ -29,15 +31,24 @@ def text_table(
     return table
 
 
-def networks_table(networks: Mapping[str, Network]) -> Table:
-    """One row a network, or a definition of several: compartments, agents, services, scenarios."""
+def networks_table(definitions: Mapping[str, Definition], *, every: bool = False) -> Table:
+    """One row a definition, by its name, or ``every`` region of it: compartments, agents, services, scenarios.
+
+    They are counted in what the definition says: no network is built, which takes seconds.
+    """
     headings = ["name", "what it is", "compartments", "agents", "services", "scenarios"]
     rows = []
-    for name, network in networks.items():
-        services = ", ".join(service.id for service in network.services) or "none"
-        scenarios = ", ".join([network.scenario_name, *network.scenarios])
-        counts = str(len(network.compartments)), str(len(network.agents))
-        rows.append([name, network.title, *counts, services, scenarios])
+    for name, definition in definitions.items():
+        document, regions = definition.document(), definition.regions
+        compartments = [*document["nodes"].values(), *document.get("arcs", {}).values()]
+        agents = document.get("agents") or [part for part in compartments if "control" in part]
+        services = [*document.get("services", {})] or ["none"]
+        more = [f"{len(services) - 2} more"] if len(services) > 2 else []
+        cells = [str(len(compartments)), str(len(agents)), ", ".join(services[:2] + more), ", ".join(definition.names)]
+        names = {f"{name}_{region}": text for region, text in regions.items()} or {name: ""}
+        if regions and not every:
+            names = {f"{name}_* ({len(regions)} regions)": "a region"}
+        rows += [[label, document["title"].replace(REGION, text), *cells] for label, text in names.items()]
     return text_table("Networks", headings, rows, text=headings, unbroken=["name"])
 
 
