@@ -1,4 +1,6 @@
-"""How many words a newcomer is asked to read: ``python tests/readability.py [CHECKOUT]`` prints them page by page.
+"""How much a newcomer is asked to read: ``python tests/readability.py [CHECKOUT]``.
+
+It prints words page by page, lines of the package, adapters apart, and which share of its names are no terms.
 
 Counted are the words of every document that is written by hand, as ``wc -w`` counts them: code blocks, commands and
 tables that somebody typed included. Not counted is what a program writes: ``docs/format.md``, the tables of
@@ -10,6 +12,8 @@ from __future__ import annotations
 import re
 import sys
 from pathlib import Path
+
+from names import fillers
 
 ROOT = Path(__file__).parent.parent
 FILES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/*.md", "[a-z]*/README.md")
@@ -42,13 +46,25 @@ def words(root: Path = ROOT) -> dict[str, int]:
     return {str(path.relative_to(root)): len(handwritten(path).split()) for path in documents(root)}
 
 
+def lines(root: Path = ROOT) -> dict[bool, int]:
+    """Return how many lines the package has: under True those of its adapters, under False all others."""
+    counts = {True: 0, False: 0}
+    for path in (root / "cirl_marl").rglob("*.py"):
+        counts["adapters" in path.parts] += len(path.read_text(encoding="utf-8").splitlines())
+    return counts
+
+
 def main() -> None:
-    """Print words by page, longest first, and their sum."""
+    """Print words by page, longest first, and their sum; then lines and names."""
     root = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT
     counts = words(root)
     for name, count in sorted(counts.items(), key=lambda pair: -pair[1]):
         sys.stdout.write(f"{count:7,}  {name}\n")
-    sys.stdout.write(f"{sum(counts.values()):7,}  in {len(counts)} documents\n")
+    sys.stdout.write(f"{sum(counts.values()):7,}  words in {len(counts)} documents\n")
+    code, (bindings, places) = lines(root), fillers(root / "cirl_marl")
+    share = len(places) / bindings
+    sys.stdout.write(f"{code[False]:7,}  lines of cirl_marl, and {code[True]:,} of its adapters\n")
+    sys.stdout.write(f"{len(places):7,}  of {bindings:,} names ({share:.2%}) pronouns or participles\n")
 
 
 if __name__ == "__main__":

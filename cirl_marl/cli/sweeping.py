@@ -99,7 +99,7 @@ def _settings(assignments: Sequence[str]) -> dict[str, str]:
     """Return settings by name."""
     for assignment in assignments:
         if "=" not in assignment:
-            raise CirlError(f"--slurm {assignment}: must be NAME=VALUE, such as slurm_partition=long")
+            raise CirlError(f"--slurm {assignment}: must be NAME=VALUE, such as partition=long")
     return {name: value for name, _, value in (assignment.partition("=") for assignment in assignments)}
 
 

@@ -70,6 +70,7 @@ def executed(script: Path) -> Executed:
             kernel_name="python3",
             resources=resources,
             record_timing=False,
+            coalesce_streams=True,  # else output is cut where the kernel happened to send it
         )
         kernel = client.create_kernel_manager()
         kernel.transport, kernel.ip = "ipc", f"{folder}/kernel"  # no port is opened
