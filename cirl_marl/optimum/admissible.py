@@ -15,7 +15,7 @@ from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record, with_field_docs
 from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Node
 from cirl_marl.network.split_fractions import Split, splits
 from cirl_marl.optimum.matrices import Layout
@@ -26,8 +26,7 @@ class NoCertificate(CirlError):
     """A network for which no upper bound is proved; the message says why."""
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class FreeSplit:
     """A split of what leaves a node in which some share can be chosen."""
 
@@ -111,13 +110,15 @@ class Admissible:
             wishes = setting[:, :, list(split.controlled_arcs)].transpose(0, 2, 1)
             (low, high), (neutral, _) = share_ranges(split, wishes[[0, 2]]), share_ranges(split, wishes[[1, 1]])
             setting[:, :, arcs] = np.stack([low.T, neutral.T, high.T])
+        driver = np.where([arc.law is Law.RECIPIENT for arc in network.arcs], network.recipients, network.donors)
+        driver[np.array([LAWS[arc.law].is_scheduled for arc in network.arcs], dtype=bool)] = -1
         base = [network.interval_means(LAWS[arc.law].coefficient(arc, network)) for arc in network.arcs]
         service_low = [network.interval_means(service.low) for service in network.services]
         return cls(
             network=network,
             lifetimes=lifetimes,
             actuators=actuators,
-            driver=np.array([_driver(network, arc) for arc in network.arcs], dtype=np.intp),
+            driver=driver,
             base=np.array(base, dtype=float).reshape(-1, steps).T,
             setting=setting[::2],
             valve=valve[::2],
@@ -245,13 +246,6 @@ def _setter(network: Network, arc: Arc) -> Arc | Node | None:
     if arc.law is Law.CONTROLLED and donor.control is not None and donor.control.kind is ControlKind.FLOW:
         return donor
     return arc if arc.control is not None else None
-
-
-def _driver(network: Network, arc: Arc) -> int:
-    """Return the node whose stock or throughput drives an arc; −1 for a scheduled one."""
-    if LAWS[arc.law].is_scheduled:
-        return -1
-    return network.node_index[arc.recipient if arc.law is Law.RECIPIENT else arc.donor]
 
 
 def _exclusions(network: Network) -> Iterator[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -14,7 +14,7 @@ from scipy import sparse
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.declarations import frozen_record, with_field_docs
+from cirl_marl.network.declarations import frozen_record, positional_record
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
 from cirl_marl.optimum.certificate import Certificate, Verification, verify
 from cirl_marl.optimum.options import (
@@ -82,14 +82,11 @@ class Bound:
             statement = f"λ̄/scale + {self.service_weight:g}·service ≤ {self.objective:.6g}"
         plan = f"λ̄ = {float(self.circularity.mean()):.6g} {mass} and serves {self.service:.4f}"
         subject = f"bound of {self.network.name} over {self.network.episode.horizon} steps"
-        return f"{subject}: {statement}; its plan promises {plan}{self._idle}"
-
-    @property
-    def _idle(self) -> str:
-        """Say which supplies nobody acts on, of which the program knows the bounds alone."""
+        # of supplies that nobody acts on the program knows the bounds alone
         agents = self.agents or self.network.agents
         idle = [arc.id for arc in self.network.arcs if arc.makes_up_for and arc.id not in agents]
-        return f"; {', '.join(idle)} may supply any amount within bounds in it" if idle else ""
+        caveat = f"; {', '.join(idle)} may supply any amount within bounds in it" if idle else ""
+        return f"{subject}: {statement}; its plan promises {plan}{caveat}"
 
     def verify(self) -> Verification:
         """Compute the bound again from the program's matrices and the multipliers, without the solver."""
@@ -127,8 +124,7 @@ class Bound:
         return gap(self.objective, value)
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Envelope:
     """Bounds of one objective, solved for different starts; at any start the least of what they prove holds."""
 
@@ -140,7 +136,12 @@ class Envelope:
         admissible = Admissible.of(first.network, first.agents or None)
         state_layout = admissible.lifetimes.state_layout
         starts = by_stage(first.network, state_layout, first.initial if initial is None else initial)
-        demand = _demand(first, min_service)
+        demand = first.min_service
+        if min_service is not None:
+            if demand is None:
+                raise CirlError("min_service: this bound demands no service; solve it with min_service")
+            check_service(min_service)
+            demand = demanded_levels(first.network, min_service, np.shape(min_service)[:-1])
         shape = np.broadcast_shapes(starts.shape[:-1], () if demand is None else demand.shape[:-1])
         programs = Programs(admissible, first.degree, first.service_weight)
         starts = np.broadcast_to(starts, (*shape, len(first.initial)))
@@ -151,16 +152,6 @@ class Envelope:
             problem = programs.program(starts[i], None if levels is None else levels[i])
             bounds[i] = min(verify(problem, member.certificate, member.solution).bound for member in self.members)
         return bounds
-
-
-def _demand(bound: Bound, min_service: ArrayLike | None) -> Floats | None:
-    """Return the demanded levels, shape (..., services); None if there are none."""
-    if min_service is None:
-        return bound.min_service
-    if bound.min_service is None:
-        raise CirlError("min_service: this bound demands no service; solve it with min_service")
-    check_service(min_service)
-    return demanded_levels(bound.network, min_service, np.shape(min_service)[:-1])
 
 
 def bound(
@@ -278,17 +269,15 @@ def _episode_network(network: str | Path | Network, scenario: str | None, horizo
 
 
 def _solve_bound(
-    programs: Programs,
-    start: Floats,
-    service_weight: float | None,
-    min_service: Floats | None,
-    basis: Basis | None = None,
+    programs: Programs, start: Floats, service_weight: float | None, min_service: Floats | None, basis: Basis | None
 ) -> Bound:
     admissible, layout = programs.admissible, programs.layout
     problem = programs.program(start, min_service)
-    label = "the program of the bound" + _request(admissible.network, service_weight, min_service)
+    request = "" if service_weight is None else f" with a service weight of {service_weight:.6g}"
+    if min_service is not None and admissible.network.services:
+        request = f" with a mean service level of {levels_text(admissible.network, min_service)}"
     try:
-        solution = solve(problem, basis, label=label)
+        solution = solve(problem, basis, label=f"the program of the bound{request}")
     except Infeasible:
         raise CirlError(_unreachable(problem, min_service)) from None
     proof = verify(problem, solution.certificate, solution.plan)
@@ -317,12 +306,6 @@ def _solve_bound(
         certificate=solution.certificate,
         basis=solution.basis,
     )
-
-
-def _request(network: Network, service_weight: float | None, min_service: Floats | None) -> str:
-    if min_service is not None and network.services:
-        return f" with a mean service level of {levels_text(network, min_service)}"
-    return "" if service_weight is None else f" with a service weight of {service_weight:.6g}"
 
 
 def _unreachable(problem: Program, min_service: Floats | None) -> str:

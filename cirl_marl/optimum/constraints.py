@@ -12,17 +12,17 @@ import numpy as np
 from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.network import Floats, Integers
 from cirl_marl.optimum.admissible import Admissible, IntervalRanges
-from cirl_marl.optimum.matrices import Layout, ProgramRows
+from cirl_marl.optimum.matrices import ProgramRows
 from cirl_marl.optimum.reach import Reach
 
 
-def balances(layout: Layout, rows: ProgramRows) -> None:
+def balances(rows: ProgramRows) -> None:
     """Add Y_i − Y_{i−1} − δ/(d + 1)·S F_i, which is 0, for i = 0 … d (theorem 1); keys (moment, node).
 
     Y_i = ((d − i) X_i + (i + 1) X_{i+1})/(d + 1) are the means weighted with the polynomials of degree d − 1;
     Y_{−1} and Y_d are the stocks at the two ends of the piece, δ its length.
     """
-    network, d = layout.network, layout.degree
+    layout, network, d = rows.layout, rows.layout.network, rows.layout.degree
     moment, node = layout.moment_column, np.arange(len(network.stores))
     row = rows.add(moment, node)
     for side, sign in ((network.donors, 1.0), (network.recipients, -1.0)):
@@ -42,9 +42,10 @@ def balances(layout: Layout, rows: ProgramRows) -> None:
             rows.at_start(row[j], piece, node, -1.0)
 
 
-def flow_laws(ranges: IntervalRanges, layout: Layout, equal: ProgramRows, under: ProgramRows) -> None:
+def flow_laws(ranges: IntervalRanges, equal: ProgramRows, under: ProgramRows) -> None:
     """Add the flow laws of an interval: rows that are 0 and rows at most 0; keys (0, moment, family, index, side)."""
-    network, moment, valves = ranges.network, layout.moment_column, layout.valves
+    network, layout = ranges.network, equal.layout
+    moment, valves = layout.moment_column, layout.valves
 
     def hold(family: int, index: Integers, column: Integers, driver: Integers, factor: Floats) -> None:
         """Hold low·driver ≤ column ≤ high·driver, with columns of shape (moments, index)."""
@@ -70,13 +71,13 @@ def flow_laws(ranges: IntervalRanges, layout: Layout, equal: ProgramRows, under:
     hold(2, arcs, layout.flow[moment] + arcs, column, factor)
 
 
-def held_controls(ranges: IntervalRanges, layout: Layout, rows: ProgramRows) -> None:
+def held_controls(ranges: IntervalRanges, rows: ProgramRows) -> None:
     """Add F_i − F_{i−1} − r (X_i − X_{i−1}), r = v·w·a at neutral, and the same for Z; keys (1, moment, family, index).
 
     For a constant factor r' it is (r' − r)(X_i − X_{i−1}), a product of two differences, here held at 0.
     """
-    moment = layout.moment_column[1:]
-    arcs, valves = np.flatnonzero(ranges.proportional & (ranges.rate[0] < ranges.rate[1])), layout.valves
+    layout, moment, valves = rows.layout, rows.layout.moment_column[1:], rows.layout.valves
+    arcs = np.flatnonzero(ranges.proportional & (ranges.rate[0] < ranges.rate[1]))
     place = np.arange(len(valves))
     families = (
         (0, arcs, layout.flow, arcs, ranges.driver[arcs], ranges.neutral_rate[arcs]),
@@ -89,14 +90,14 @@ def held_controls(ranges: IntervalRanges, layout: Layout, rows: ProgramRows) -> 
             rows.put(row, layout.stock[at] + driver, -sign * rate)
 
 
-def throughputs(ranges: IntervalRanges, layout: Layout, rows: ProgramRows) -> None:
+def throughputs(ranges: IntervalRanges, rows: ProgramRows) -> None:
     """Add what holds of throughputs and shares in an interval, each 0; keys (2, moment, family, index).
 
     What enters a node that stores nothing is its throughput Q, and so is what leaves it. The shares of what a stock
     releases sum to the release. Arcs without control keep their proportions. Where all shares are given, the flow laws
     say it already.
     """
-    network, moment = ranges.network, layout.moment_column
+    network, layout, moment = ranges.network, rows.layout, rows.layout.moment_column
     stores, nodes, arcs = len(network.stores), len(network.nodes), np.arange(len(network.arcs))
     row = np.full((len(layout.moments), nodes), -1)
     row[:, stores:] = rows.add(2, moment, 0, np.arange(stores, nodes))
@@ -116,16 +117,16 @@ def throughputs(ranges: IntervalRanges, layout: Layout, rows: ProgramRows) -> No
         rows.put(row_of_follower, layout.flow[moment] + split.leader, -split.ratio)
 
 
-def delivery_limits(ranges: IntervalRanges, layout: Layout, rows: ProgramRows) -> None:
+def delivery_limits(ranges: IntervalRanges, rows: ProgramRows) -> None:
     """Add U·δ − x_start·z/(e^z − 1), at most 0, for the scheduled outflow U of each node; keys (0, piece, node).
 
     This is how the simulator cuts scheduled flows, with z = a·δ for the proportional exits of rate a; the least a gives
     the most. What flows in during the piece is not available to them. Of coarse pieces nothing is said.
     """
+    layout = rows.layout
     if layout.coarse:
         return
     turnover = ranges.exits[0] * layout.length
-    # U·δ ≤ x_start·z/(e^z − 1); the factor falls with z, so the least rate of the exits gives the weakest, valid row
     share = np.divide(turnover, np.expm1(turnover), out=np.ones(len(turnover)), where=turnover > 1e-9)
     arcs = np.flatnonzero(ranges.by_schedule)
     nodes, place = np.unique(ranges.network.donors[arcs], return_inverse=True)
@@ -135,12 +136,13 @@ def delivery_limits(ranges: IntervalRanges, layout: Layout, rows: ProgramRows) -
     rows.at_start(row, piece, nodes, -share[nodes] / layout.length)
 
 
-def constant_schedules(ranges: IntervalRanges, layout: Layout, equal: ProgramRows, under: ProgramRows) -> None:
+def constant_schedules(ranges: IntervalRanges, equal: ProgramRows, under: ProgramRows) -> None:
     """Add that a scheduled flow is constant in its piece, F_i = F_0; keys (0, moment, 0, arc, side).
 
     If pieces are coarse, a flow that nothing can cut is constant in the interval.
     """
-    moment, arcs = layout.moment_column, np.flatnonzero(ranges.by_schedule)
+    layout, arcs = equal.layout, np.flatnonzero(ranges.by_schedule)
+    moment = layout.moment_column
     first = 0 * moment if layout.coarse else moment - moment % (layout.degree + 1)
     later = (moment > first).ravel()
     for rows, side, sign in ((under, 0, 1.0), (under, 1, -1.0)) if layout.coarse else ((equal, 0, 1.0),):
@@ -151,12 +153,12 @@ def constant_schedules(ranges: IntervalRanges, layout: Layout, equal: ProgramRow
             rows.loosen(row, arcs, 1.0)
 
 
-def service_levels(ranges: IntervalRanges, layout: Layout, rows: ProgramRows) -> None:
+def service_levels(ranges: IntervalRanges, rows: ProgramRows) -> None:
     """Add low·level − q ≤ 0 for each service and ±Δ·σ_env·f̄ − imbalance ≤ 0; their keys are (1, …).
 
     The level is at most min(1, q/low): a finite upper end of the band could only lower it further.
     """
-    network, count = layout.network, len(layout.moments)
+    layout, network, count = rows.layout, ranges.network, len(rows.layout.moments)
     for s, service in enumerate(network.services):
         row = rows.add(1, s)
         rows.put(row, layout.level + s, ranges.service_low[s])  # level ≤ q/low; level ≤ 1 is a box

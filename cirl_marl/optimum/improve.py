@@ -263,7 +263,6 @@ def demand(bound: Bound) -> Floats:
 def refine(
     bound: Bound,
     *,
-    rounds: int = REFINEMENT_ROUNDS,
     enough: Callable[[Rollout], bool] = lambda run: False,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Bound:
@@ -280,15 +279,14 @@ def refine(
 
     Args:
         bound: with the actions to start from.
-        rounds: most programs to solve.
         enough: asked of each episode that is better than those before, whether to stop there.
-        progress: called with the share of them that is solved; 1 when no more are needed.
+        progress: called with the share of REFINEMENT_ROUNDS programs that is solved; 1 when no more are needed.
     """
     admissible = Admissible.of(bound.network, bound.agents or None)
     price, best, run = prices(bound), bound, simulate_plan(bound)
     value = penalised_objective(bound, run, price)
     factor = 1.0 + _shortfall(bound.problem.layout, bound.solution, run, 1.0)
-    for done in range(rounds):
+    for done in range(REFINEMENT_ROUNDS):
         if enough(run):
             break
         demand_ranges = replace(admissible, service_low=admissible.service_low * factor)
@@ -302,7 +300,7 @@ def refine(
         actions = normalised_actions(demand_ranges, layout, variables.reshape(-1, layout.size))
         candidate = replace(bound, actions=actions)
         trial = simulate_plan(candidate)
-        progress((done + 1) / rounds)
+        progress((done + 1) / REFINEMENT_ROUNDS)
         if (worth := penalised_objective(bound, trial, price)) > value:
             best, run, value = candidate, trial, worth
         shortfall = _shortfall(layout, variables, trial, factor)

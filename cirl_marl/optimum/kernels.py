@@ -111,7 +111,8 @@ class _Smooth:
         self._degree, self._columns = degree, start.shape[1]
         count = max(1, math.ceil(float(np.abs(matrix).sum(axis=0).max(initial=0.0)) / 2))
         nodes = (1 - np.cos(np.pi * (2 * np.arange(degree + 1) + 1) / (2 * degree + 2))) / 2
-        bernstein = np.stack([_polynomial(degree, j, nodes) for j in range(degree + 1)], axis=1)
+        polynomials = [math.comb(degree, j) * nodes**j * (1 - nodes) ** (degree - j) for j in range(degree + 1)]
+        bernstein = np.stack(polynomials, axis=1)
         values = np.stack([expm(matrix * node) @ start for node in nodes], axis=2)
         self._near = values @ np.linalg.inv(bernstein).T  # coefficients of B_j(σ) that interpolate, shape (n, z, d + 1)
         step, at = expm(matrix / count), start
@@ -152,10 +153,6 @@ def bernstein_means(matrix: Floats, degree: int, length: float = 1.0) -> tuple[F
         for i in range(degree + 1)
     ]
     return np.array(means), first[0]
-
-
-def _polynomial(degree: int, j: int, at: Floats) -> Floats:
-    return math.comb(degree, j) * at**j * (1 - at) ** (degree - j)
 
 
 def _derivatives(degree: int, j: int) -> Floats:

@@ -15,7 +15,7 @@ window ends. With ``horizon=None`` the window shrinks with what is left of the e
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
@@ -26,7 +26,7 @@ from cirl_marl.controllers.basic import Arrays, Planner
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, ControlError
 from cirl_marl.network import Floats
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import Admissible, NoCertificate, normalised_actions
 from cirl_marl.optimum.bounds import Bound, bound
 from cirl_marl.optimum.cross_entropy import KNOTS, Incumbent, search_each
@@ -42,34 +42,32 @@ BOUND = 0.3
 """About the share of solving for the bound in the work on a plan; the rest is to improve it."""
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class _Plan:
     """What is planned for one copy."""
 
     episode: Annotated[int, "of the copy, by its number"]
     intervals: Annotated[range, "of the episode"]
-    problem: Annotated[Program | None, "the program; None if nothing could be planned"]
-    solution: Annotated[Solution | None, "its optimum, likewise"]
+    optimum: Annotated[tuple[Program, Solution] | None, "of which program, and which; None if nothing could be planned"]
     actions: Annotated[Floats, "of the first intervals, shape (decisions, entries)"]
     unit: Annotated[float, "what 1 of its objective is in the objective of plans that meet the demand"]
 
     def basis(self, intervals: range) -> Basis | None:
         """Return the basis from which to plan ``intervals``; None if they are neither as many nor the last of these."""
-        if self.problem is None or self.solution is None:
+        if self.optimum is None or self.optimum[1].basis is None:
             return None
+        problem, basis = self.optimum[0], self.optimum[1].basis
         if len(intervals) == len(self.intervals):
-            return self.solution.basis
+            return basis
         if intervals.stop != self.intervals.stop or intervals.start < self.intervals.start:
             return None
-        basis = self.solution.basis
-        return None if basis is None else basis.without_first(self.problem, intervals.start - self.intervals.start)
+        return basis.without_first(problem, intervals.start - self.intervals.start)
 
     def levels(self) -> Floats:
         """Return the planned level of each service in each interval, shape (intervals, services)."""
-        assert self.problem is not None and self.solution is not None
-        layout = self.problem.layout
-        return self.solution.plan.reshape(-1, layout.size)[:, layout.level : layout.imbalance]
+        assert self.optimum is not None
+        layout = self.optimum[0].layout
+        return self.optimum[1].plan.reshape(-1, layout.size)[:, layout.level : layout.imbalance]
 
     def prices(self) -> Floats:
         """Return what the rows of the next interval charge for the stocks at the end of each, shape (intervals, nodes).
@@ -77,9 +75,8 @@ class _Plan:
         They are the terms of c − Aᵀy − Gᵀμ, for those stocks, of rows that belong to the interval after, in the
         objective of plans that meet the demand.
         """
-        assert self.problem is not None and self.solution is not None
-        problem, certificate = self.problem, self.solution.certificate
-        layout = problem.layout
+        assert self.optimum is not None
+        problem, certificate, layout = self.optimum[0], self.optimum[1].certificate, self.optimum[0].layout
         costs = np.zeros(len(problem.cost))
         for matrix, multipliers in ((problem.equal, certificate.equal), (problem.under, certificate.under)):
             # entry (row, column): the row belongs to the last interval that it touches, the column to its own
@@ -204,17 +201,13 @@ class MPC(Planner):
 
     def _older(self, copy: int, window: range, last: _Plan | None) -> _Plan:
         """Return the last plan, to be carried out for longer, or one to be neutral where it has come to its end."""
-        is_running = last is not None and window.start in last.intervals
-        if is_running and last is not None and last.problem is not None and last.solution is not None:
+        if last is not None and last.optimum is not None and window.start in last.intervals:
+            problem, solution = last.optimum
             done = window.start - last.intervals.start + self._replan
-            variables = last.solution.plan.reshape(len(last.intervals), -1)[:done]
-            return replace(last, actions=self._actions(last.problem, last.intervals, variables))
+            decided = solution.plan.reshape(len(last.intervals), -1)[:done]
+            return replace(last, actions=normalised_actions(self._admissible, problem.layout, decided, last.intervals))
         neutral = np.concatenate([action[copy] for action in self._env.neutral_action.values()])
-        return _Plan(int(self._env.episodes[copy]), window, None, None, np.tile(neutral, (self._replan, 1)), 1.0)
-
-    def _actions(self, problem: Program, intervals: range, plan: Floats) -> Floats:
-        """Return the actions of planned intervals, the first of ``intervals``, shape (decisions, entries)."""
-        return normalised_actions(self._admissible, problem.layout, plan, intervals)
+        return _Plan(int(self._env.episodes[copy]), window, None, np.tile(neutral, (self._replan, 1)), 1.0)
 
     def _plan(
         self,
@@ -236,34 +229,27 @@ class MPC(Planner):
             prices: of the stocks at the end, shape (nodes,), in the objective of plans that meet the demand, per mass.
             as_outlook: whether the multipliers must be good, as they are the prices of later plans.
         """
-        stock = self._env.physical.stock[self._env.rows.nodes, copy]
+        env, episode = self._env, self._env.network.episode
+        stock = env.physical.stock[env.rows.nodes, copy]
         demand = None if deficit is None else np.maximum(0.0, deficit / len(intervals))
-        unit = 1.0
         task = f"the program of MPC for decisions {intervals.start} to {intervals.stop - 1}"
-        try:
-            problem = self._with_prices(self._programs, stock, intervals, demand, prices)
-            solution = solve(problem, basis, label=task, certify=as_outlook)
-        except Infeasible:
-            if demand is None:
-                raise
-            unit = self._env.network.objective.circularity_scale
-            prices = None if prices is None else prices / unit
-            problem = _without_demand(self._with_prices(self._urgent, stock, intervals, demand, prices))
-            solution = solve(problem, basis, label=task, certify=as_outlook)
-        variables = solution.plan.reshape(len(intervals), -1)[: self._replan]
-        actions = self._actions(problem, intervals, variables)
-        return _Plan(int(self._env.episodes[copy]), intervals, problem, solution, actions, unit)
-
-    def _with_prices(
-        self, programs: Programs, stock: Floats, intervals: range, demand: Floats | None, prices: Floats | None
-    ) -> Program:
-        """Return the program of some intervals with the objective of the episode, plus what the last stocks cost."""
-        problem = programs.program(stock, demand, intervals)
-        layout = problem.layout
-        cost = problem.cost.reshape(len(intervals), -1) * (len(intervals) / self._env.network.episode.horizon)
-        if prices is not None:
-            cost[-1, layout.last] += prices
-        return replace(problem, cost=cost.ravel())
+        for programs, unit in ((self._programs, 1.0), (self._urgent, env.network.objective.circularity_scale)):
+            problem = programs.program(stock, demand, intervals)
+            cost = problem.cost.reshape(len(intervals), -1) * (len(intervals) / episode.horizon)
+            if prices is not None:
+                cost[-1, problem.layout.last] += prices / unit
+            problem = replace(problem, cost=cost.ravel())
+            if programs is self._urgent:
+                problem = _without_demand(problem)
+            try:
+                solution = solve(problem, basis, label=task, certify=as_outlook)
+                break
+            except Infeasible:
+                if demand is None or programs is self._urgent:
+                    raise
+        decided = solution.plan.reshape(len(intervals), -1)[: self._replan]
+        actions = normalised_actions(self._admissible, problem.layout, decided, intervals)
+        return _Plan(int(env.episodes[copy]), intervals, (problem, solution), actions, unit)
 
 
 def _without_demand(problem: Program) -> Program:
@@ -317,18 +303,16 @@ class Optimum(Planner):
         plans: list[Bound] = []
         by_start: dict[bytes, Bound] = {}  # copies that start alike have the same plan, though their draws differ
         for copy, start in enumerate(env.physical.stock[env.rows.nodes].T):
-            report = _report(progress, copy, env.num_envs)
+
+            def report(improvement: float, copy: int = copy) -> None:
+                progress((copy + BOUND + (1 - BOUND) * improvement) / env.num_envs)
+
             if (key := start.tobytes()) in by_start:
                 plans.append(by_start[key])
                 report(1.0)
                 continue
-            solution = bound(
-                env.network,
-                start,
-                min_service=self._min_service,
-                service_weight=self._service_weight,
-                agents=env.agents or None,
-            )
+            service, weight = self._min_service, self._service_weight
+            solution = bound(env.network, start, min_service=service, service_weight=weight, agents=env.agents or None)
             report(0.0)
             plans.append(improve_plan(solution, progress=report))
             by_start[key] = plans[-1]
@@ -344,8 +328,3 @@ class Optimum(Planner):
             knots=min(KNOTS, env.network.episode.horizon),
             progress=lambda share, objective: progress(share),
         )
-
-
-def _report(progress: Callable[[float], None], copy: int, copies: int) -> Callable[[float], None]:
-    """Return what takes the share of a copy's improvement that is done; its bound is solved."""
-    return lambda improvement: progress((copy + BOUND + (1 - BOUND) * improvement) / copies)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Annotated, Protocol
 
 import numpy as np
@@ -13,7 +13,7 @@ from cirl_marl.controllers.rollout import EVALUATION_SEEDS, Rollout, rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, ControlError
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.bounds import Bound
 
 SAME_START = 1e-9
@@ -105,8 +105,7 @@ def simulate_plan(bound: Bound) -> Rollout:
     return rollout(env, Plan(replace(bound, network=start_network)), start=start)
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Episodes:
     """What episodes were like, for each start and each copy that began there."""
 
@@ -120,7 +119,7 @@ class Episodes:
 
 
 class Population:
-    """Copies of a network, equally many from each of some starts."""
+    """Copies of a network, equally many from each of some starts; ``agents`` act by ``entries`` of an action."""
 
     def __init__(self, network: Network, agents: Sequence[str] | None, starts: Floats, size: int) -> None:
         """Make the environment and put its copies where they start.
@@ -139,13 +138,9 @@ class Population:
         if not env.agents:
             raise CirlError(f"network '{network.name}': nobody acts, so there is nothing to search for")
         self.agents = env.agents
+        self.entries = sum(neutral.shape[1] for neutral in env.neutral_action.values())
         env.reset(seed=EVALUATION_SEEDS, options={"initial_state": by_state_name(env, np.repeat(starts, size, axis=0))})
         self._start = env.snapshot()
-
-    @property
-    def entries(self) -> int:
-        """Entries of a stacked action."""
-        return sum(neutral.shape[1] for neutral in self._env.neutral_action.values())
 
     def run(
         self,

@@ -97,18 +97,18 @@ class Programs:
         self._equal, self._under = ChainedRows(layout), ChainedRows(layout)
         for kind, ranges in admissible.ranges.items():
             equal_links, equal, under_links, under = (ProgramRows(layout) for _ in range(4))
-            balances(layout, equal_links)
-            constant_schedules(ranges, layout, equal, under)
-            flow_laws(ranges, layout, equal, under)
-            throughputs(ranges, layout, equal)
+            balances(equal_links)
+            constant_schedules(ranges, equal, under)
+            flow_laws(ranges, equal, under)
+            throughputs(ranges, equal)
             if hold_controls:
-                held_controls(ranges, layout, equal)
-            delivery_limits(ranges, layout, under_links)
-            service_levels(ranges, layout, under)
-            decay_rows(ranges, layout, under_links)
+                held_controls(ranges, equal)
+            delivery_limits(ranges, under_links)
+            service_levels(ranges, under)
+            decay_rows(ranges, under_links)
             if layout.has_end_flows:
-                end_laws(ranges, layout, equal, under)
-                quasi_steady_rows(ranges, layout, fast_system.of_kind(kind), under_links)
+                end_laws(ranges, equal, under)
+                quasi_steady_rows(ranges, fast_system.of_kind(kind), under_links)
             self._equal.add(kind, equal_links, equal)
             self._under.add(kind, under_links, under)
         self._weights, self._constant = objective(layout, service_weight)
@@ -175,7 +175,7 @@ def _reach(lifetimes: Lifetimes, system: ComparisonSystem, initial: Floats, inte
     reach = system.reach(lifetimes.start_reached @ initial, intervals, list(lines.values()))
     most = [
         passive.rate[intervals.start : intervals.stop] * reach.upper[:, passive.reached_node]
-        + passive.at_once * reach.upper[:, passive.reached_entry]
+        + passive.chain.weights[0] * reach.upper[:, passive.reached_entry]
         if len(passive.rate)
         else np.array([lines[passive.reached_arc].most(t, reach.inflow) for t in range(len(intervals))])
         for passive in lifetimes.passive

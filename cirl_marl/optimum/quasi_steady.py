@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
+from scipy import sparse, special
 
 from cirl_marl.network import Floats, Integers
 from cirl_marl.optimum.admissible import Admissible, IntervalRanges
@@ -41,23 +41,22 @@ WIDER, ROUND_OFF = 1.0 + 1e-9, 1e-12
 """Factor and allowance by which transients are widened; rounding errors are far smaller."""
 
 
-def decay_rows(ranges: IntervalRanges, layout: Layout, rows: ProgramRows) -> None:
+def decay_rows(ranges: IntervalRanges, rows: ProgramRows) -> None:
     """Add the rows of theorem 2 on an interval, each at most 0; their keys are (1, node, piece, quantity, i)."""
-    network, driver, valves = ranges.network, ranges.driver, layout.valves
+    network, layout, driver = ranges.network, rows.layout, ranges.driver
     # what recipients pull may make a stock fall faster than in proportion to it
     pull_donors = network.donors[~ranges.by_schedule & (driver != network.donors)]
     nodes = np.setdiff1d(driver[~ranges.by_schedule], pull_donors)
     nodes = nodes[nodes < len(network.stores)]
     if not len(nodes):
         return
-    chains = _DecayChains(ranges, layout, rows)
+    chains = _DecayChains(ranges, rows)
     chains.write_stocks(nodes)
     position = np.full(len(network.nodes), -1)
-    position[valves] = np.arange(len(valves))
-    valve = ranges.valve
-    through = np.intersect1d(valves, nodes)
+    position[layout.valves] = np.arange(len(layout.valves))
+    through = np.intersect1d(layout.valves, nodes)
     column = layout.valve[0] + position[through]
-    chains.write_factors(through, 0 * through, column, through, valve[:, through], 1.0)
+    chains.write_factors(through, 0 * through, column, through, ranges.valve[:, through], 1.0)
     arcs = np.setdiff1d(np.flatnonzero(np.isin(driver, nodes) & ranges.proportional), ranges.followers)
     driver = driver[arcs]
     # behind a valve that several outflows share the driver is Z, else X
@@ -68,7 +67,7 @@ def decay_rows(ranges: IntervalRanges, layout: Layout, rows: ProgramRows) -> Non
         layout.flow[0] + arcs,
         np.where(behind, layout.valve[0] + position[driver], driver),
         np.where(behind, ranges.setting[:, arcs] * ranges.base[arcs], ranges.rate[:, arcs]),
-        np.where(behind, valve[1, driver], 1.0),
+        np.where(behind, ranges.valve[1, driver], 1.0),
     )
 
 
@@ -79,7 +78,8 @@ class _DecayChains:
     ω_i = ₁F₁(i + 1; d + 2; −kδ).
     """
 
-    def __init__(self, ranges: IntervalRanges, layout: Layout, rows: ProgramRows) -> None:
+    def __init__(self, ranges: IntervalRanges, rows: ProgramRows) -> None:
+        layout = rows.layout
         rate, d = ranges.exits[1], layout.degree
         i, turnover = np.arange(d + 1), (rate * layout.length)[:, None]
         self.means = np.concatenate([special.hyp1f1(i + 1, d + 2, -turnover), np.exp(-turnover)], axis=1)
@@ -88,10 +88,9 @@ class _DecayChains:
         self.delays = np.divide(1.0 - self.means, rate[:, None], out=slow.copy(), where=turnover >= 1e-6)
         self.layout, self.rows = layout, rows
         self.first = np.arange(layout.pieces) * (d + 1)  # moment of each piece
-        donors = np.where(ranges.by_schedule, ranges.network.donors, len(rate))
-        self.schedules = np.argsort(donors, kind="stable")  # scheduled arcs, donor after donor
-        self.counts = np.bincount(donors, minlength=len(rate))[: len(rate)]
-        self.starts = np.cumsum(self.counts) - self.counts
+        arcs = np.flatnonzero(ranges.by_schedule)
+        places = (ranges.network.donors[arcs], arcs)
+        self.schedules = sparse.csr_array((np.ones(len(arcs)), places), shape=(len(rate), len(ranges.driver)))
 
     def write_stocks(self, nodes: Integers) -> None:
         """Write the chain of each stock from the start of a piece to its end."""
@@ -164,11 +163,8 @@ class _DecayChains:
 
         In coarse pieces what is asked in the interval stands for it; a flow that may be cut is below it at times.
         """
-        # node after node its scheduled outflows: place is that of the node, offset counts within it
-        counts = self.counts[nodes]
-        place = np.repeat(np.arange(len(nodes)), counts)
-        offset = np.arange(len(place)) - np.repeat(np.cumsum(counts) - counts, counts)
-        arcs = self.schedules[self.starts[nodes[place]] + offset]
+        schedules = self.schedules[nodes].tocoo()
+        place, arcs = schedules.row, schedules.col
         moment = 0 * self.first if self.layout.coarse else self.first
         self.rows.put(row[:, place], self.layout.flow[moment[:, None]] + arcs, weight[place])
         if self.layout.coarse:
@@ -181,9 +177,10 @@ def has_fast_stocks(admissible: Admissible, length: float) -> bool:
     return any((ranges.exits[0, :stores] * length >= FAST[0]).any() for ranges in admissible.ranges.values())
 
 
-def end_laws(ranges: IntervalRanges, layout: Layout, equal: ProgramRows, under: ProgramRows) -> None:
+def end_laws(ranges: IntervalRanges, equal: ProgramRows, under: ProgramRows) -> None:
     """Add the flow laws at the end of merged pieces; keys (3, piece, family, index, side)."""
-    network, rate, piece = ranges.network, ranges.rate, np.arange(layout.pieces)[:, None]
+    network, rate, layout = ranges.network, ranges.rate, equal.layout
+    piece = np.arange(layout.pieces)[:, None]
     stores, nodes, arcs = len(network.stores), len(network.nodes), np.arange(len(network.arcs))
     schedules = np.flatnonzero(ranges.by_schedule)
     for side, sign in ((0, 1.0), (1, -1.0)):
@@ -218,48 +215,41 @@ def end_laws(ranges: IntervalRanges, layout: Layout, equal: ProgramRows, under: 
         equal.put(row, layout.end_flow[piece] + split.leader, -split.ratio)
 
 
-def quasi_steady_rows(ranges: IntervalRanges, layout: Layout, linear: Linear, rows: ProgramRows) -> None:
+def quasi_steady_rows(ranges: IntervalRanges, linear: Linear, rows: ProgramRows) -> None:
     """Add the rows of theorem 3, at most 0, on an interval and the stocks before; keys (2, …)."""
-    network, has_schedule = ranges.network, ranges.by_schedule
+    network, layout, has_schedule = ranges.network, rows.layout, ranges.by_schedule
     if (ranges.driver[~has_schedule] != network.donors[~has_schedule]).any():
         return  # what recipients pull may make a stock fall faster than in proportion to it
     stores = len(network.stores)
     least, most = ranges.exits[:, :stores]
     by_schedule = np.bincount(network.donors[has_schedule], minlength=stores)[:stores] > 0
-    _write_held_factors(ranges, layout, rows, ~by_schedule)
+    _write_held_factors(ranges, rows, ~by_schedule)
     choices: set[bytes] = set()
     for turnover in FAST:
         fast = (least * layout.length >= turnover) & ~by_schedule
         if fast.tobytes() not in choices:
             choices.add(fast.tobytes())
             slowest = float(most[~fast & ~by_schedule].max(initial=0.0))
-            _QuasiSteady(ranges, layout, linear, rows, len(choices), fast, slowest).write()
+            _QuasiSteady(ranges, linear, rows, len(choices), fast).write(slowest)
 
 
-def _write_held_factors(ranges: IntervalRanges, layout: Layout, rows: ProgramRows, usable: NDArray[np.bool_]) -> None:
+def _write_held_factors(ranges: IntervalRanges, rows: ProgramRows, usable: NDArray[np.bool_]) -> None:
     """Add that (w − w̲)·x and (w̄ − w)·x fall at most as x does; keys (2, 0, piece, arc and side, i)."""
-    stores, (low, high), fastest = len(usable), ranges.rate, ranges.exits[1]
+    stores, (low, high), fastest, layout = len(usable), ranges.rate, ranges.exits[1], rows.layout
     slow = np.append(usable & (fastest[:stores] * layout.length < FAST[-1]), False)
     arcs = np.flatnonzero((low < high) & ranges.proportional & slow[np.minimum(ranges.driver, stores)])
     arcs = np.setdiff1d(arcs, ranges.followers)
     for i in range(layout.degree + 1):
         growth = _growth(fastest[ranges.driver[arcs]], layout, i)
         for side in (0, 1):
-            _put_factor(ranges, layout, rows, (0, 2 * arcs + side), arcs, side, i, growth)
+            _put_factor(ranges, rows, (0, 2 * arcs + side), arcs, side, i, growth)
 
 
 def _put_factor(
-    ranges: IntervalRanges,
-    layout: Layout,
-    rows: ProgramRows,
-    key: tuple[int, Integers],
-    arcs: Integers,
-    side: int,
-    i: int,
-    growth: Any,
+    ranges: IntervalRanges, rows: ProgramRows, key: tuple[int, Integers], arcs: Integers, side: int, i: int, growth: Any
 ) -> Integers:
     """Write that (w − w̲)·x, or (w̄ − w)·x on side 1, is in moment i at most ``growth`` times what it is at the end."""
-    choice, index = key
+    (choice, index), layout = key, rows.layout
     piece = np.arange(layout.pieces)[:, None]
     moment = piece * (layout.degree + 1) + i
     sign, bound, driver = (1.0, -1.0)[side], ranges.rate[side, arcs], ranges.driver[arcs]
@@ -272,35 +262,28 @@ def _put_factor(
 
 
 class _QuasiSteady:
-    """Writes the rows for one choice of fast stores, with κ = ``slowest``."""
+    """Writes the rows for one choice of fast stores, which are given by a mask."""
 
     def __init__(
-        self,
-        ranges: IntervalRanges,
-        layout: Layout,
-        linear: Linear,
-        rows: ProgramRows,
-        choice: int,
-        fast: NDArray[np.bool_],
-        slowest: float,
+        self, ranges: IntervalRanges, linear: Linear, rows: ProgramRows, choice: int, fast: NDArray[np.bool_]
     ) -> None:
-        self.ranges, self.layout, self.rows, self.choice, self.slowest = ranges, layout, rows, choice, slowest
+        self.ranges, self.layout, self.rows, self.choice = ranges, rows.layout, rows, choice
         self.network, self.stores = ranges.network, len(ranges.network.stores)
         self.fast = np.flatnonzero(fast)
         self._find_sources(fast)
         gains = linear.gains.toarray()[np.ix_(fast, fast)]
         exits = np.diag(ranges.exits[0, self.fast])
         # e^{Ms} under B_0 … B_d, and e^{Mδ}, each at least as large as it is
-        means, last = bernstein_means(gains - exits, layout.degree, layout.length)
+        means, last = bernstein_means(gains - exits, rows.layout.degree, rows.layout.length)
         means = np.maximum(np.concatenate([means, last[None]]), 0.0) * WIDER + ROUND_OFF
         self.after = means[-1]
         # of every node the transient of its stock or throughput, from the fast stocks at the start
-        self.transients = np.zeros((layout.degree + 1, len(self.network.nodes), len(self.fast)))
+        self.transients = np.zeros((rows.layout.degree + 1, len(self.network.nodes), len(self.fast)))
         self.transients[:, self.fast] = means[:-1]
         self.transients[:, self.stores :] = linear.pass_flow.toarray()[:, fast] @ means[:-1]
         fastest = float(ranges.exits[1, : self.stores].max(initial=0.0))
         # what an arc carries can be nowhere more than this times what is asked of it
-        self.loose = (1.0 + layout.network.episode.control_interval) * (1.0 + fastest) * linear.routes.longest
+        self.loose = (1.0 + self.network.episode.control_interval) * (1.0 + fastest) * linear.routes.longest
 
     def _find_sources(self, fast: NDArray[np.bool_]) -> None:
         """Find the nodes that follow from slow stocks and schedules, and the schedules that they follow from."""
@@ -320,9 +303,9 @@ class _QuasiSteady:
             np.logical_or.at(self.schedules, recipients[through], self.schedules[donors[through]])
         self.follows = hands_on & ~wrong
 
-    def write(self) -> None:
-        """Write all rows."""
-        ranges, layout, network, slowest = self.ranges, self.layout, self.network, self.slowest
+    def write(self, slowest: float) -> None:
+        """Write all rows, with κ = ``slowest``."""
+        ranges, layout, network = self.ranges, self.layout, self.network
         piece, (low, high) = np.arange(layout.pieces)[:, None], ranges.rate
         nodes = np.flatnonzero(self.follows)
         arcs = np.setdiff1d(np.flatnonzero((low < high) & ~ranges.by_schedule), ranges.followers)
@@ -332,11 +315,12 @@ class _QuasiSteady:
             row = self.rows.add(2, self.choice, piece, nodes, i)
             self.rows.put(row, layout.stock[moment] + nodes, 1.0)
             self.rows.put(row, layout.end[piece] + nodes, -growth)
-            self._allow(row, piece, nodes, i, np.ones(len(nodes)))
+            self._allow(row, nodes, self.transients[i, nodes], np.ones(len(nodes)))
             for side in (0, 1):
                 key = self.choice, len(network.nodes) + 2 * arcs + side
-                row = _put_factor(ranges, layout, self.rows, key, arcs, side, i, growth)
-                self._allow(row, piece, ranges.driver[arcs], i, high[arcs] - low[arcs])
+                row = _put_factor(ranges, self.rows, key, arcs, side, i, growth)
+                driver = ranges.driver[arcs]
+                self._allow(row, driver, self.transients[i, driver], high[arcs] - low[arcs])
         fast = nodes[nodes < self.stores]
         row = np.full((layout.pieces, len(network.nodes)), -1)
         row[:, fast] = self.rows.add(2, self.choice, piece, fast, layout.degree + 1)
@@ -346,19 +330,14 @@ class _QuasiSteady:
         margin = (ranges.exits[0, np.minimum(into, self.stores - 1)] - slowest) * layout.length
         factor = layout.length * special.exprel(-margin) * WIDER  # (1 − e^{−(k − κ)δ})/(k − κ)
         self.rows.put(row[:, into], layout.end_flow[piece] + inflows, -factor)
-        self._put_transients(row[:, fast], piece, self.after[np.searchsorted(self.fast, fast)])
-        self._loosen(row[:, fast], fast, np.ones(len(fast)))
+        self._allow(row[:, fast], fast, self.after[np.searchsorted(self.fast, fast)], np.ones(len(fast)))
 
-    def _allow(self, row: Integers, piece: Integers, nodes: Integers, i: int, factor: Floats) -> None:
-        """Allow for the transients of nodes, times a factor, and for schedules that may be cut."""
-        self._put_transients(row, piece, self.transients[i, nodes] * factor[:, None])
-        self._loosen(row, nodes, factor)
-
-    def _put_transients(self, row: Integers, piece: Integers, transients: Floats) -> None:
+    def _allow(self, row: Integers, nodes: Integers, transients: Floats, factor: Floats) -> None:
+        """Allow for the transients of nodes, and for schedules that may be cut, both times a factor."""
+        transients = transients * factor[:, None]
         place, source = np.nonzero(transients)
+        piece = np.arange(self.layout.pieces)[:, None]
         self.rows.at_start(row[:, place], piece, self.fast[source], -transients[place, source])
-
-    def _loosen(self, row: Integers, nodes: Integers, factor: Floats) -> None:
         place, arcs = np.nonzero(self.schedules[nodes])
         self.rows.loosen(row[:, place], arcs, self.loose * factor[place])
 

@@ -9,7 +9,6 @@ flow realised.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from scipy.sparse.linalg import splu
 from cirl_marl.dynamics.laws import ArcRates
 from cirl_marl.dynamics.visit_bounds import VisitBounds
 from cirl_marl.network import Floats
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import Admissible, IntervalRanges, NoCertificate
 
 DENSE = 256
@@ -152,8 +151,7 @@ def _least_arrivals(shares: Any, arrivals: Floats, visits: Floats) -> Floats:
     return least
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Reach:
     """What the stocks can be."""
 
@@ -164,8 +162,7 @@ class Reach:
     inflow: Annotated[Floats, "most that enters each stock in each interval, shape (steps, stores), mass"]
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class DelayLine:
     """What comes out of a fixed lifetime."""
 

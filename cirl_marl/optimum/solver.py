@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Annotated
 
@@ -17,7 +16,7 @@ from scipy import sparse
 
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import NoCertificate
 from cirl_marl.optimum.certificate import Certificate, verify
 from cirl_marl.optimum.program import LinearProgram, Program
@@ -68,8 +67,7 @@ class SolverFailure(NoCertificate):
     """A program that HiGHS does not solve, whatever is tried; the message says which, and how it ended."""
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Basis:
     """Which variables and rows are basic, and at which bound the others are; HiGHS completes one that is too small."""
 
@@ -82,8 +80,7 @@ class Basis:
         return Basis(self.columns[intervals * problem.layout.size :], self.rows[rows >= intervals])
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Solution:
     """An optimum."""
 
@@ -119,7 +116,9 @@ def solve(
         Unsolved: if HiGHS finds no usable answer; names the network, what was not solved, and HiGHS's status.
     """
     name, answer, best, status, is_refused = problem.layout.network.name, None, math.inf, "", False
-    attempts = _settings(problem)
+    is_large = len(problem.cost) >= LARGE_PROGRAM
+    # without its package HiGHS takes another solver for HiPO
+    attempts: Sequence[HighsOptions] = LARGE_SETTINGS[0 if find_spec(EXTRA) else 1 :] if is_large else SETTINGS
     program = _ScaledProgram(problem, np.maximum(np.abs(problem.low), np.abs(problem.high)))
     for settings in (None, *attempts) if basis is not None else attempts:
         highs = program.run(settings, basis if settings is None else None, primal=same_rows)
@@ -135,13 +134,13 @@ def solve(
         distance = program.distance(problem, solution)
         if distance < best:
             answer, best = solution, distance
-        if best <= (OPTIMAL if attempts is SETTINGS else NEAR):
+        if best <= (NEAR if is_large else OPTIMAL):
             break
     # presolve errs now and then, so the last settings, without it, have the last word
     if answer is None and is_refused:
         raise Infeasible(f"network '{name}': HiGHS finds that nothing satisfies {label}")
     if answer is None or (certify and best > USABLE):
-        lacks_hipo = len(problem.cost) >= LARGE_PROGRAM and not find_spec(EXTRA)
+        lacks_hipo = is_large and not find_spec(EXTRA)
         advice = f"; of {len(problem.cost):,} variables HiPO may: pip install 'cirl-marl[large]'" if lacks_hipo else ""
         raise SolverFailure(f"network '{name}': HiGHS did not solve {label}: {status}{advice}")
     return answer
@@ -160,13 +159,6 @@ def best_values(problem: LinearProgram, size: Floats) -> Floats | None:
         if program.is_feasible(highs):
             return program.solution(highs).plan
     return None
-
-
-def _settings(problem: LinearProgram) -> Sequence[HighsOptions]:
-    """Return what is tried for a program; HiPO only where its package is installed, as HiGHS takes another one else."""
-    if len(problem.cost) < LARGE_PROGRAM:
-        return SETTINGS
-    return LARGE_SETTINGS if find_spec(EXTRA) else LARGE_SETTINGS[1:]
 
 
 class _ScaledProgram:

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
@@ -28,7 +27,7 @@ from cirl_marl.dynamics.laws import ArcRates
 from cirl_marl.dynamics.stages import StagedNetwork, simulated_network, staged_network
 from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Node
 from cirl_marl.network.lifetimes import Chain
 from cirl_marl.optimum.kernels import Kernel, unit_outflow
@@ -38,8 +37,7 @@ LOOSE = 2e-4
 """Distance of the bounds of what leaves, relative to it, above which intervals have more pieces."""
 
 
-@with_field_docs
-@dataclass(frozen=True, slots=True)
+@positional_record
 class PassiveLifetime:
     """A lifetime that nobody controls."""
 
@@ -48,7 +46,6 @@ class PassiveLifetime:
     exit_arc: Annotated[int, "the arc of the planned network through which what has lived goes"]
     inflow_arcs: Annotated[Integers, "its arcs through which something enters"]
     rate: Annotated[Floats, "μ in each interval, shape (steps,), 1/time; empty for a fixed one"]
-    at_once: Annotated[float, "w_0, part of what enters that leaves at once"]
     reached_node: Annotated[int, "the node, or its last stage, among the nodes of ``reached``"]
     reached_entry: Annotated[int, "where what enters is among them; the node itself of a fixed one"]
     reached_arc: Annotated[int, "``leaving`` among its arcs"]
@@ -113,7 +110,6 @@ class Lifetimes:
                     exit_arc=plan_network.arc_index[plan_network.release_arcs[node.id]],
                     inflow_arcs=np.flatnonzero(plan_network.recipients == plan_network.node_index[node.id]),
                     rate=rate,
-                    at_once=0.0 if chain is None else chain.weights[0],
                     reached_entry=reach_network.node_index[node.id if chain is None else f"{node.id}.entry"],
                     reached_node=reach_network.node_index[node.id],
                     reached_arc=reach_network.arc_index[plan_network.release_arcs[node.id]],
