@@ -19,6 +19,7 @@ from cirl_marl.errors import CirlError
 
 if TYPE_CHECKING:
     from cirl_marl.network import Network
+    from cirl_marl.report.presentation import Reportable
 
 NETWORKS, EPISODES, LEARNERS, COMPARISONS = "Networks", "Episodes and plans", "Learners", "Comparisons"
 """Groups of commands in ``cirl --help``."""
@@ -138,6 +139,15 @@ def page_for(path: Path | None) -> Path | None:
         raise CirlError(f"--html {path}: is a folder, not a file")
     _check_writable(path, f"--html {path}")
     return path
+
+
+def browser_report(path: Path | None, result: Reportable) -> list[Path]:
+    """Write a report for the browser, if it is asked for, and return the paths of what was written."""
+    if path is None:
+        return []
+    from cirl_marl.report.presentation import write_report
+
+    return [write_report(path, result)]
 
 
 def _check_writable(path: Path, subject: str) -> None:

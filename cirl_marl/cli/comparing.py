@@ -66,14 +66,9 @@ def compare(
     console.print(comparison_table(comparison))
     for note in comparison_notes(comparison):
         say(note)
-    if folder is not None:
-        for path in write_comparison(comparison, folder, controllers=names, **options):
-            say(f"wrote {path}")
-    if page is not None:
-        from cirl_marl.report.page_html import write_page
-        from cirl_marl.report.report_page import page_of_comparison
-
-        say(f"wrote {write_page(page, page_of_comparison(comparison))}")
+    files = [] if folder is None else write_comparison(comparison, folder, controllers=names, **options)
+    for path in [*files, *common.browser_report(page, comparison)]:
+        say(f"wrote {path}")
 
 
 @app.command(rich_help_panel=COMPARISONS)
@@ -124,10 +119,5 @@ def pareto(
             say(f"{kind:8} service {point.service:.4f}  λ̄ {point.circularity:.5g} {front.network.mass_unit}{about}")
     if front.reason:
         say(f"no bound: {front.reason}")
-    for path in write_front(front, folder, recipe=recipe, **options):
+    for path in [*write_front(front, folder, recipe=recipe, **options), *common.browser_report(page, front)]:
         say(f"wrote {path}")
-    if page is not None:
-        from cirl_marl.report.page_html import write_page
-        from cirl_marl.report.report_page import page_of_front
-
-        say(f"wrote {write_page(page, page_of_front(front))}")

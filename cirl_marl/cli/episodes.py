@@ -18,6 +18,7 @@ from cirl_marl.cli.common import (
     Scenario,
     app,
     bar,
+    browser_report,
     console,
     folder_for,
     page_for,
@@ -87,11 +88,8 @@ def simulate(
         _write_one(folder, files)
     else:
         _write_several(folder, files)
-    if page is not None:
-        from cirl_marl.report.page_html import write_page
-        from cirl_marl.report.report_page import page_of_alternatives
-
-        say(f"wrote {write_page(page, page_of_alternatives(found))}")
+    for path in browser_report(page, found):
+        say(f"wrote {path}")
 
 
 def _sample(
@@ -212,11 +210,7 @@ def plan(
     beside = write_decisions(path, schedule, title=f"{network.title or network.name}: {control or 'what was learnt'}")
     if path.with_suffix(".xlsx") not in beside:
         say(NO_WORKBOOK)
-    if page is not None:
-        from cirl_marl.report.page_html import write_page
-        from cirl_marl.report.report_page import page_of_schedule
-
-        beside.append(write_page(page, page_of_schedule(schedule)))
+    beside += browser_report(page, schedule)
     console.print(decisions_table(schedule))
     console.print(savings_table(schedule))
     _say_lines(str(schedule))

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.artist import Artist
+from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.lines import Line2D
 from matplotlib.patches import FancyBboxPatch, Patch, Rectangle
@@ -17,9 +18,6 @@ from cirl_marl.drawing.digraph_layout import DigraphLayout, Routes, bezier, digr
 from cirl_marl.drawing.style import FAINT, GOOD, INK, NEUTRAL, ROLE_COLOURS, WARNING, check_shape, number, readable
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import Law, Role
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 LARGEST_EM = 14.0
 """Largest font of a digraph, points."""

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
+from cirl_marl.environments.parallel import GymnasiumView
 from cirl_marl.environments.single import SingleAgentEnv
 from cirl_marl.environments.state import Snapshot
 from cirl_marl.errors import CirlError
@@ -21,7 +21,7 @@ Goals = dict[str, NDArray[np.float32]]
 PARTS = ("observation", "achieved_goal", "desired_goal")
 
 
-class GoalEnv(gymnasium.Env[Goals, NDArray[np.float32]]):
+class GoalEnv(GymnasiumView):
     """A ``SingleAgentEnv`` whose observation is a dictionary, as in gymnasium-robotics.
 
     The entries ``observation``, ``achieved_goal`` and ``desired_goal`` are what the agent's model calls so; the reward
@@ -33,8 +33,6 @@ class GoalEnv(gymnasium.Env[Goals, NDArray[np.float32]]):
         agent: the compartment that acts.
     """
 
-    metadata = SingleAgentEnv.metadata
-
     def __init__(self, network: str | Path | Network, agent: str | None = None, **options: Any) -> None:
         """Make the environment; arguments are those of ``SingleAgentEnv``.
 
@@ -43,6 +41,7 @@ class GoalEnv(gymnasium.Env[Goals, NDArray[np.float32]]):
                 the local reward has a set-point or a service in it too.
         """
         self.flat = SingleAgentEnv(network, agent, **options)
+        super().__init__(self.flat.parallel)
         self.agent = self.flat.agent
         model = self.flat.network.compartments[self.agent].model
         names = [name.split(".")[-1] for name in self.flat.parallel.layout.names[self.agent]]
@@ -68,17 +67,6 @@ class GoalEnv(gymnasium.Env[Goals, NDArray[np.float32]]):
             {part: spaces.Box(box.low[rows], box.high[rows], dtype=np.float32) for part, rows in self._parts.items()}
         )
         self.action_space = self.flat.action_space
-        self.render_mode = self.flat.render_mode
-        self.metadata = self.flat.metadata
-
-    def __str__(self) -> str:
-        """Return the name of the network and its scenario."""
-        return str(self.flat)
-
-    @property
-    def network(self) -> Network:
-        """The network under the chosen scenario."""
-        return self.flat.network
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Goals, dict[str, Any]]:
         """Start an episode; see ``SingleAgentEnv.reset``."""
@@ -113,14 +101,6 @@ class GoalEnv(gymnasium.Env[Goals, NDArray[np.float32]]):
     def restore(self, snapshot: Snapshot) -> Goals:
         """Go back to a snapshot and return the observation there."""
         return self._split(self.flat.restore(snapshot))
-
-    def render(self) -> Any:
-        """Draw the network; see ``NetworkParallelEnv.render``."""
-        return self.flat.render()
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        self.flat.close()
 
     def _split(self, observation: NDArray[np.float32]) -> Goals:
         return {part: observation[rows] for part, rows in self._parts.items()}

@@ -18,7 +18,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from cirl_marl.environments.parallel import METADATA, OPTIONS, NetworkParallelEnv, check_options, first_copy
+from cirl_marl.environments.parallel import OPTIONS, GymnasiumView, NetworkParallelEnv, check_options, first_copy
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, ControlError, unknown_name
 from cirl_marl.network import Floats, Network
@@ -26,7 +26,7 @@ from cirl_marl.network import Floats, Network
 JointObservation = NDArray[np.float32]
 
 
-class JointEnv(gymnasium.Env[JointObservation, JointObservation]):
+class JointEnv(GymnasiumView):
     """One copy of a network in which one learner acts for all agents.
 
     ``info`` has the keys of ``MultiAgentVectorEnv.team_info``, as numbers of this copy; in the last step of an episode
@@ -36,20 +36,12 @@ class JointEnv(gymnasium.Env[JointObservation, JointObservation]):
         parallel: the same environment as a dict of agents, which says what each entry is.
     """
 
-    metadata: dict[str, Any] = METADATA
-
     def __init__(self, network: str | Path | Network, **options: Any) -> None:
         """Make the environment; options and errors are those of ``parallel_env``."""
-        self.parallel = NetworkParallelEnv(network, **options)
-        self.metadata = self.parallel.metadata
-        self.render_mode = self.parallel.render_mode
+        super().__init__(NetworkParallelEnv(network, **options))
         self.observation_space: spaces.Space[Any]
         self.action_space: spaces.Space[Any]
         self.observation_space, self.action_space, self._entries = _joint_spaces(self.parallel.batch)
-
-    def __str__(self) -> str:
-        """Return the name of the network and its scenario."""
-        return str(self.parallel)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -71,14 +63,6 @@ class JointEnv(gymnasium.Env[JointObservation, JointObservation]):
         if truncated:
             info |= batch.episode_figures()
         return outcome.observation[:, 0], _mean(outcome.reward).item(), False, truncated, first_copy(info)
-
-    def render(self) -> Any:
-        """Draw the network; see ``NetworkParallelEnv.render``."""
-        return self.parallel.render()
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        self.parallel.close()
 
 
 class JointVectorEnv(gymnasium.vector.VectorEnv[JointObservation, JointObservation, NDArray[Any]]):

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import ArrayLike, NDArray
@@ -207,6 +208,34 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         for agent in outcome.success.keys() & infos.keys():
             infos[agent]["success"] = bool(outcome.success[agent][0])
         return infos
+
+
+class GymnasiumView(gymnasium.Env[Any, NDArray[np.float32]]):
+    """What Gymnasium's views of a network have in common: they show ``parallel``, its PettingZoo view, otherwise."""
+
+    metadata: dict[str, Any] = METADATA
+
+    def __init__(self, parallel: NetworkParallelEnv) -> None:
+        """Take the environment, its pictures and its name."""
+        self.parallel = parallel
+        self.metadata, self.render_mode = parallel.metadata, parallel.render_mode
+
+    def __str__(self) -> str:
+        """Return the name of the network and its scenario."""
+        return str(self.parallel)
+
+    @property
+    def network(self) -> Network:
+        """The network under the chosen scenario."""
+        return self.parallel.network
+
+    def render(self) -> Any:
+        """Draw the network; see ``NetworkParallelEnv.render``."""
+        return self.parallel.render()
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self.parallel.close()
 
 
 def first_copy(batch: Mapping[str, Any]) -> dict[str, Any]:

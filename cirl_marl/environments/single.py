@@ -6,18 +6,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.environments.parallel import METADATA, OPTIONS, NetworkParallelEnv, check_options
+from cirl_marl.environments.parallel import OPTIONS, GymnasiumView, NetworkParallelEnv, check_options
 from cirl_marl.environments.state import Snapshot
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Network
 
 
-class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
+class SingleAgentEnv(GymnasiumView):
     """One compartment of a network acts.
 
     With ``scenario="paper"`` this is the environment of the CiRL paper: its observation is the state in the paper's
@@ -27,8 +26,6 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     Attributes:
         agent: the compartment that acts.
     """
-
-    metadata: dict[str, Any] = METADATA
 
     def __init__(
         self,
@@ -63,28 +60,17 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         definition = load_network(network) if isinstance(network, str | Path) else network
         name = _scenario_of(definition, scenario, agent)
         agents = None if agent is None else [agent]
-        self.parallel = NetworkParallelEnv(definition, scenario=name, agents=agents, **options)
+        super().__init__(NetworkParallelEnv(definition, scenario=name, agents=agents, **options))
         if len(self.parallel.possible_agents) != 1:
             choices = ", ".join(self.parallel.possible_agents)
             raise CirlError(f"network '{self.network.name}' has several agents: give agent=, one of {choices}")
         self.agent = self.parallel.possible_agents[0]
-        self.metadata = self.parallel.metadata
         self._legacy, self._legacy_steps = legacy_episode, 0
-        self.render_mode = self.parallel.render_mode
         self.observation_space = self.parallel.observation_space(self.agent)
         self.action_space = self.parallel.action_space(self.agent)
         self.observation_names = {self.agent: self.parallel.observation_names[self.agent]}
         rows = {name: row for row, name in enumerate(self.parallel.state_names)}
         self._order = np.array([rows[name] for name in self.parallel.layout.array_order or rows], dtype=np.intp)
-
-    def __str__(self) -> str:
-        """Return the name of the network and its scenario."""
-        return str(self.parallel)
-
-    @property
-    def network(self) -> Network:
-        """The network under the chosen scenario."""
-        return self.parallel.network
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -115,14 +101,6 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         observations = self.parallel.restore(snapshot)
         self._legacy_steps = snapshot.legacy_steps
         return observations[self.agent]
-
-    def render(self) -> Any:
-        """Draw the network; see ``NetworkParallelEnv.render``."""
-        return self.parallel.render()
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        self.parallel.close()
 
     def _paper_state(self) -> NDArray[np.float64]:
         return self.parallel.state()[self._order]

@@ -213,7 +213,6 @@ def in_copies(name: str, envs: Sequence[gymnasium.Env[Any, Any]], seeds: Sequenc
 
 def _batch_of(env: gymnasium.Env[Any, Any]) -> MultiAgentVectorEnv:
     inner = env.unwrapped
-    single = inner.flat if isinstance(inner, GoalEnv) else inner
-    if not isinstance(single, SingleAgentEnv):
+    if not isinstance(inner, GoalEnv | SingleAgentEnv):
         raise RecipeError(f"demonstrations: controllers act in networks, and {type(inner).__name__} is none")
-    return single.parallel.batch
+    return inner.parallel.batch

@@ -6,9 +6,9 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.special import stdtrit
 
@@ -29,9 +29,6 @@ from cirl_marl.drawing.style import (
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import Law
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 AGENT_PANELS = 20
 MOST_CURVES = 10

@@ -209,7 +209,7 @@ def _times(network: Network) -> list[str]:
     return interval_names(network, lambda time: f"{number(time)} {network.time_unit}")
 
 
-def save_decisions(path: str | Path, schedule: Schedule, *, title: str) -> Path:
+def save_decisions(path: str | Path, schedule: Schedule, *, title: str = "") -> Path:
     """Save λ and the levers that differ most from business as usual, plan beside usual, as a PNG; return its path."""
     network, mass = schedule.network, schedule.network.mass_unit
     time = axis_time(interval_ends(network) - network.episode.control_interval / 2, network)
@@ -223,7 +223,7 @@ def save_decisions(path: str | Path, schedule: Schedule, *, title: str) -> Path:
             unit = "factor on lifetime"
         draw = partial(_draw, time=time, plan=lever.plan * factor, usual=lever.usual * factor)
         panels.append(Panel(lever.name, unit, draw, limits))
-    return save_panels(path, network, panels, title=title, legend=2)
+    return save_panels(path, network, panels, title=title or network.title or network.name, legend=2)
 
 
 def _draw(axes: Axes, time: Floats, plan: Floats, usual: Floats) -> None:

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from cirl_marl.controllers.rollout import interval_ends
 from cirl_marl.drawing.style import DASHES, SERIES, axis_time, readable
-from cirl_marl.evaluation.compared_quantities import ComparedQuantity
+from cirl_marl.evaluation.compared_quantities import ComparedQuantity, rank_quantities
 from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.evaluation.statistics import finite_or_none
 from cirl_marl.network import Floats
@@ -74,14 +74,18 @@ def _row(quantity: ComparedQuantity) -> list[object]:
 
 
 def save_alternatives(
-    path: str | Path, simulations: Sequence[Simulation], quantities: Sequence[ComparedQuantity], *, title: str = ""
+    path: str | Path,
+    simulations: Sequence[Simulation],
+    quantities: Sequence[ComparedQuantity] | None = None,
+    *,
+    title: str = "",
 ) -> Path:
     """Save the trajectories of simulations, laid over each other, as a PNG and return its path.
 
     There are at most 8 panels: mean λ, the levels of the 3 services that differ most, and the flows and stocks that
     differ most by ``quantities``, which are what ``rank_quantities`` found.
     """
-    network = simulations[0].network
+    network, quantities = simulations[0].network, quantities or rank_quantities(simulations)
     kinds = {
         kind: [quantity for quantity in quantities if quantity.kind == kind] for kind in ("circularity", "service")
     }
@@ -97,7 +101,7 @@ def save_alternatives(
         }[quantity.kind]
         limits = LEVELS if quantity.kind == "service" else None
         panels.append(Panel(heading, unit, partial(_draw, simulations=simulations, quantity=quantity), limits))
-    return save_panels(path, network, panels, title=title, legend=4)
+    return save_panels(path, network, panels, title=title or network.name, legend=4)
 
 
 def _draw(axes: Axes, simulations: Sequence[Simulation], quantity: ComparedQuantity) -> None:

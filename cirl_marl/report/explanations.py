@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
 
@@ -30,9 +31,6 @@ from cirl_marl.reasons.sentences import (
 )
 from cirl_marl.records.files import publish_folder, write_json, write_table
 from cirl_marl.report.terminal import text_table
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 FOLDER, FILE = "reasons", "reasons.json"
 """Where a run keeps its reasons."""

@@ -6,17 +6,14 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cirl_marl.controllers.rollout import interval_ends
 from cirl_marl.drawing.style import WIDTH, axis_time, save, style_axes, time_axis
 from cirl_marl.network import Network
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 PANELS, COLUMNS = 8, 2
 """Largest number of panels of a picture, and how many stand side by side."""

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import singledispatch
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any, TypeVar
 
 from rich.console import Group, RenderableType
 
 from cirl_marl.controllers.schedule import Schedule
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.assessment import Evaluation
-from cirl_marl.evaluation.compared_quantities import rank_quantities
 from cirl_marl.evaluation.comparison import Comparison
 from cirl_marl.evaluation.pareto import ParetoFront
 from cirl_marl.evaluation.simulations import Simulation
@@ -42,21 +41,7 @@ def write_report(path: str | Path, result: Reportable) -> Path:
     path = Path(path)
     if path.suffix != ".html":
         raise CirlError(f"{path}: a report needs the name of an .html file")
-    return write_page(path, _page(result))
-
-
-@singledispatch
-def _page(result: object) -> report_page.ReportPage:
-    if isinstance(result, Sequence) and result and all(isinstance(simulation, Simulation) for simulation in result):
-        return report_page.page_of_alternatives(result)
-    raise CirlError(f"there is no report of a {type(result).__name__}")
-
-
-_page.register(Schedule, report_page.page_of_schedule)
-_page.register(Comparison, report_page.page_of_comparison)
-_page.register(ParetoFront, report_page.page_of_front)
-_page.register(Evaluation, page_of_evaluation)
-_page.register(Simulation, lambda simulation: report_page.page_of_alternatives([simulation]))
+    return write_page(path, _of_its_kind(_PAGES, result, "report")(result))
 
 
 def draw(path: str | Path, result: Reportable, *, title: str = "") -> Path:
@@ -72,62 +57,47 @@ def draw(path: str | Path, result: Reportable, *, title: str = "") -> Path:
     Raises:
         CirlError: for a result that has no picture.
     """
-    return _draw(result, Path(path), title)
+    return _of_its_kind(_PICTURES, result, "picture")(Path(path), result, title=title)
 
 
-@singledispatch
-def _draw(result: object, path: Path, title: str) -> Path:
-    if isinstance(result, Sequence) and result and all(isinstance(simulation, Simulation) for simulation in result):
-        return save_alternatives(path, result, rank_quantities(result), title=title or result[0].network.name)
-    raise CirlError(f"there is no picture of a {type(result).__name__}")
-
-
-@_draw.register
-def _(result: Simulation, path: Path, title: str) -> Path:
-    return draw_trajectory(path, result, title or f"{result.network.title or result.network.name}, {result.control}")
-
-
-@_draw.register
-def _(result: Schedule, path: Path, title: str) -> Path:
-    return save_decisions(path, result, title=title or result.network.title or result.network.name)
-
-
-@_draw.register
-def _(result: Comparison, path: Path, title: str) -> Path:
-    return save_comparison(path, result, title=title)
-
-
-@_draw.register
-def _(result: ParetoFront, path: Path, title: str) -> Path:
-    return save_pareto(path, result, title=title)
-
-
-@_draw.register
-def _(result: Evaluation, path: Path, title: str) -> Path:
-    del title
-    return draw_circularity(path, result)
-
-
-@singledispatch
 def summarise(result: object) -> RenderableType:
     """Return the tables and sentences that the command line shows of a result, for ``rich.print``.
 
     Args:
         result: what ``plan``, ``compare`` or ``evaluate`` has returned; of anything else its ``str``.
     """
+    if isinstance(result, Schedule):
+        return Group(decisions_table(result), savings_table(result), str(result))
+    if isinstance(result, Comparison):
+        return Group(comparison_table(result), *comparison_notes(result))
+    if isinstance(result, Evaluation):
+        return Group(evaluation_table(result.figures), str(result))
     return str(result)
 
 
-@summarise.register
-def _(result: Schedule) -> RenderableType:
-    return Group(decisions_table(result), savings_table(result), str(result))
+_PAGES: Mapping[type, Callable[[Any], report_page.ReportPage]] = {
+    Simulation: lambda simulation: report_page.page_of_alternatives([simulation]),
+    Sequence: report_page.page_of_alternatives,
+    Schedule: report_page.page_of_schedule,
+    Comparison: report_page.page_of_comparison,
+    ParetoFront: report_page.page_of_front,
+    Evaluation: page_of_evaluation,
+}
+_PICTURES: Mapping[type, Callable[..., Path]] = {
+    Simulation: draw_trajectory,
+    Sequence: save_alternatives,
+    Schedule: save_decisions,
+    Comparison: save_comparison,
+    ParetoFront: save_pareto,
+    Evaluation: draw_circularity,
+}
+Presenter = TypeVar("Presenter")
 
 
-@summarise.register
-def _(result: Comparison) -> RenderableType:
-    return Group(comparison_table(result), *comparison_notes(result))
-
-
-@summarise.register
-def _(result: Evaluation) -> RenderableType:
-    return Group(evaluation_table(result.figures), str(result))
+def _of_its_kind(presenters: Mapping[type, Presenter], result: object, form: str) -> Presenter:
+    """Return what presents a result; several simulations are a kind of their own, ``Sequence``."""
+    several = isinstance(result, Sequence) and result and all(isinstance(part, Simulation) for part in result)
+    kind = Sequence if several else type(result)
+    if kind not in presenters:
+        raise CirlError(f"there is no {form} of a {type(result).__name__}")
+    return presenters[kind]

@@ -53,7 +53,7 @@ def draw_run(evaluation: Evaluation) -> list[Path]:
     return [flows, circularity, curves]
 
 
-def draw_circularity(path: Path, evaluation: Evaluation) -> Path:
+def draw_circularity(path: Path, evaluation: Evaluation, *, title: str = "") -> Path:
     """Save λ and service level over time, trained beside neutral and random control, as a PNG; return its path."""
     network, rollouts = evaluation.env.network, evaluation.rollouts
     means = {name: rollout.circularity_mean for name, rollout in rollouts.items()}

@@ -30,7 +30,7 @@ def write_trajectory(folder: Path, name: str, simulation: Simulation, title: str
     is left at the start of the episode.
     """
     network = simulation.env.network
-    files = [simulation.write(folder / f"{name}.csv"), draw_trajectory(folder / f"{name}.png", simulation, title)]
+    files = [simulation.write(folder / f"{name}.csv"), draw_trajectory(folder / f"{name}.png", simulation, title=title)]
     if of_ages := pyramids(network, simulation.rollout, simulation.start):
         ages, bars = folder / f"{name}_ages.csv", folder / f"{name}_ages.png"
         write_atomically(ages, lambda draft: write_table(draft, *ages_table(network, of_ages)))
@@ -38,9 +38,9 @@ def write_trajectory(folder: Path, name: str, simulation: Simulation, title: str
     return files
 
 
-def draw_trajectory(path: Path, simulation: Simulation, title: str) -> Path:
+def draw_trajectory(path: Path, simulation: Simulation, *, title: str = "") -> Path:
     """Save λ, service level, stocks and flows of a simulated episode over time as a PNG; return its path."""
-    env, episode = simulation.env, simulation.rollout
+    env, episode, network = simulation.env, simulation.rollout, simulation.network
     simulation.episode_start.reset(env)
     return save_trajectory(
         path,
@@ -52,7 +52,7 @@ def draw_trajectory(path: Path, simulation: Simulation, title: str) -> Path:
         start=np.concatenate([simulation.start, env.dynamics.batches.loads(env.physical.stock)[:, 0]]),
         load=episode.load.T,
         service=episode.service[0] if env.network.services else None,
-        title=title,
+        title=title or f"{network.title or network.name}, {simulation.control}",
     )
 
 
