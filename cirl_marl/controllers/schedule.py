@@ -100,22 +100,25 @@ def schedule(
     return Schedule(network, header, np.array(table), origin, run, usual, env.agents, start)
 
 
+CONTROL_NAMES = {
+    ControlKind.FLOW: "flow ordered ({flow_unit})",
+    ControlKind.RATE: "valve factor (1)",
+    ControlKind.SHARE: "share (1)",
+    ControlKind.STRETCH: "lifetime factor (1)",
+}
+"""What an agent sets, by the kind of its control; inputs of models have names of their own, which end in their unit."""
+
+
 def control_names(network: Network, agents: tuple[str, ...]) -> Iterator[str]:
     """Yield what each entry of the actions sets, with its unit."""
+    flow_unit = f"{network.mass_unit}/{network.time_unit}"
     for agent in agents:
-        compartment = network.compartments[agent]
-        control = compartment.control
+        control, model = network.compartments[agent].control, network.compartments[agent].model
         assert control is not None
-        if control.kind is ControlKind.FLOW:
-            yield f"{agent}: flow ordered ({network.mass_unit}/{network.time_unit})"
-        elif control.kind is ControlKind.RATE:
-            yield f"{agent}: valve factor (1)"
-        elif control.kind is ControlKind.SHARE:
-            yield f"{agent}: share (1)"
-        elif control.kind is ControlKind.STRETCH:
-            yield f"{agent}: lifetime factor (1)"
-        elif compartment.model is not None:
-            yield from (f"{agent}: {name}" for name in compartment.model.input_names)  # they end in their unit
+        if control.kind in CONTROL_NAMES:
+            yield f"{agent}: {CONTROL_NAMES[control.kind].format(flow_unit=flow_unit)}"
+        elif model is not None:
+            yield from (f"{agent}: {name}" for name in model.input_names)
 
 
 def _throughputs(network: Network, agents: tuple[str, ...], flow: Floats) -> Iterator[tuple[str, Floats]]:

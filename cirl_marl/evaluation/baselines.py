@@ -8,6 +8,7 @@ least; their multipliers prove a bound for every other start and service, so tha
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import field
 from typing import Annotated
 
 import numpy as np
@@ -31,10 +32,10 @@ FRONT = 41
 class Baseline:
     """Proven bounds on λ̄ by start and service."""
 
-    envelope: Annotated[Envelope | None, "proves them; None if nothing is proved"]
+    envelope: Annotated[Envelope | None, "proves them; None if nothing is proved"] = None
     front: Annotated[
         Floats, "levels demanded of all services and bounds on λ̄ at the mean start, by level, shape (points, 2)"
-    ]
+    ] = field(default_factory=lambda: np.empty((0, 2)))
     reason: Annotated[str, "why nothing is proved; empty if something is, or nothing was asked for"] = ""
 
     def at(self, starts: Floats, levels: Floats) -> Floats | None:

@@ -180,15 +180,22 @@ def compare(
         checkpoints.append(controller.checkpoint.name if isinstance(controller, Trained) else "")
         reporter = ProgressController(controller, part_of(progress, contender.name, place * share, share))
         rollouts.append(rollout(contender.env(episodes), reporter, seed=first, progress=reporter.report_steps))
-    measure, bounds_by_entry = _without_bounds(len(candidates), "")
+    baseline = Baseline()
+    bounds_by_entry: list[Floats | None] = [None] * len(candidates)
     if bounds:
         first_env, done = candidates[0].env(episodes), len(candidates) * share
-        starts, names = starting_stocks(first_env, first), [who_acts.name for who_acts in candidates]
-        report = part_of(progress, "bounds", done, 1 - done)
-        if (factors := first_env.physical.factors_if_any) is None:
-            measure, bounds_by_entry = _certain_bounds(env, starts, names, rollouts, report)
-        else:
-            measure, bounds_by_entry = _bounds_with_draws(env, starts, factors.T, rollouts, report)
+        starts, levels = starting_stocks(first_env, first), [run.episode_levels for run in rollouts]
+        factors, report = first_env.physical.factors_if_any, part_of(progress, "bounds", done, 1 - done)
+        try:
+            if factors is None:
+                names = [who_acts.name for who_acts in candidates]
+                baseline, bounds_by_entry = _certain_bounds(env, starts, names, levels, report)
+            else:
+                draws = bounds_of_draws(env.network, env.agents, starts, factors.T, levels, progress=report)
+                bounds_by_entry = [*draws]
+        except NoCertificate as missing:
+            report(1.0)
+            baseline = Baseline(reason=str(missing))
     neutral = next(
         run
         for candidate, run in zip(candidates, rollouts, strict=True)
@@ -198,7 +205,7 @@ def compare(
         Entry(candidate.name, candidate.seed, candidate.run, checkpoint, run, gain(run, neutral), bound)
         for candidate, checkpoint, run, bound in zip(candidates, checkpoints, rollouts, bounds_by_entry, strict=True)
     )
-    return Comparison(env.network, env.agents, first, entries, measure)
+    return Comparison(env.network, env.agents, first, entries, baseline)
 
 
 def starting_stocks(env: MultiAgentVectorEnv, seed: int) -> Floats:
@@ -211,46 +218,22 @@ def _certain_bounds(
     env: MultiAgentVectorEnv,
     starts: Floats,
     names: Sequence[str],
-    rollouts: Sequence[Rollout],
+    levels: Sequence[Floats],
     progress: Callable[[float], None],
 ) -> tuple[Baseline, list[Floats | None]]:
-    """Return the baseline of all rows, and the bounds of the episodes of each rollout."""
+    """Return the baseline of all rows, and the bounds of episodes with the ``levels`` of services of each entry."""
     services: dict[str, list[Floats]] = {}
-    for name, run in zip(names, rollouts, strict=True):
-        services.setdefault(name, []).append(run.episode_levels)
-    levels = [np.mean(samples, axis=0) for samples in services.values()]
-    try:
-        measure = solve_baseline(
-            env.network, env.agents, starts, levels, progress=lambda share: progress(SOLVER_SHARE * share)
-        )
-        bounds: list[Floats | None] = []
-        for run in rollouts:
-            bounds.append(measure.at(starts, run.episode_levels))
-            progress(SOLVER_SHARE + (1 - SOLVER_SHARE) * len(bounds) / len(rollouts))
-        return measure, bounds
-    except NoCertificate as missing:
-        progress(1.0)
-        return _without_bounds(len(rollouts), str(missing))
-
-
-def _bounds_with_draws(
-    env: MultiAgentVectorEnv,
-    starts: Floats,
-    factors: Floats,
-    rollouts: Sequence[Rollout],
-    progress: Callable[[float], None],
-) -> tuple[Baseline, list[Floats | None]]:
-    """Return the bounds of the episodes of each rollout, every episode with the numbers that it drew."""
-    levels = [run.episode_levels for run in rollouts]
-    try:
-        bounds = bounds_of_draws(env.network, env.agents, starts, factors, levels, progress=progress)
-    except NoCertificate as missing:
-        return _without_bounds(len(rollouts), str(missing))
-    return Baseline(None, np.empty((0, 2))), [*bounds]
-
-
-def _without_bounds(entries: int, reason: str) -> tuple[Baseline, list[Floats | None]]:
-    return Baseline(None, np.empty((0, 2)), reason), [None] * entries
+    for name, levels_of_entry in zip(names, levels, strict=True):
+        services.setdefault(name, []).append(levels_of_entry)
+    means = [np.mean(samples, axis=0) for samples in services.values()]
+    baseline = solve_baseline(
+        env.network, env.agents, starts, means, progress=lambda share: progress(SOLVER_SHARE * share)
+    )
+    bounds: list[Floats | None] = []
+    for levels_of_entry in levels:
+        bounds.append(baseline.at(starts, levels_of_entry))
+        progress(SOLVER_SHARE + (1 - SOLVER_SHARE) * len(bounds) / len(levels))
+    return baseline, bounds
 
 
 def part_of(progress: ProgressReport, activity: str, done: float, share: float) -> Callable[[float], None]:

@@ -14,11 +14,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from cirl_marl.errors import CirlError, unknown_name
-from cirl_marl.jobs.slurm import Slurm, sbatch_options
-from cirl_marl.jobs.work import Work
-
-EXTRAS = {"ray": "ray"}
-"""Packages that a place needs, and the extra of this library that installs them."""
+from cirl_marl.jobs.slurm import Slurm, sbatch_options, settings_text
+from cirl_marl.jobs.work import Work, text_lines
 
 
 class Worker(Protocol):
@@ -145,7 +142,7 @@ class Ray:
         Raises:
             CirlError: if Ray is not installed, or there is no cluster at the address.
         """
-        self._ray = _capacity("ray")
+        self._ray = _ray()
         if not self._ray.is_initialized():
             try:
                 dashboard = False if not _address() else None
@@ -173,26 +170,20 @@ def _address() -> str:
     return os.environ.get("RAY_ADDRESS", "")
 
 
-def _capacity(package: str) -> Any:
-    """Import what a place needs."""
+def _ray() -> Any:
+    """Import Ray, or say that it is missing."""
     try:
-        return import_module(package)
+        return import_module("ray")
     except ModuleNotFoundError as error:
-        if error.name != package:
+        if error.name != "ray":
             raise
-        extra = EXTRAS[package]
         raise CirlError(
-            f"--on {extra} needs the package {package}, which is not installed: pip install 'cirl-marl[{extra}]'"
+            "--on ray needs the package ray, which is not installed: pip install 'cirl-marl[ray]'"
         ) from None
 
 
 def _last_line(error: BaseException) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[-1] if lines else type(error).__name__
-
-
-def _settings(settings: Mapping[str, str]) -> str:
-    return " ".join(f"{name}={value}" for name, value in settings.items())
+    return (text_lines(str(error)) or [type(error).__name__])[-1]
 
 
 PLACES: tuple[str, ...] = ("here", "local", "slurm", "ray")
@@ -207,16 +198,15 @@ def check_place(on: str, workers: int | None = None, settings: Mapping[str, str]
     if on not in PLACES:
         raise CirlError(unknown_name("place", on, PLACES))
     if settings and on != "slurm":
-        raise CirlError(f"--slurm {_settings(settings)}: goes with --on slurm, not with --on {on}")
+        raise CirlError(f"{settings_text(settings)}: goes with --on slurm, not with --on {on}")
     if workers is not None and workers < 1:
         raise CirlError(f"workers must be at least 1, got {workers}")
     if on == "here" and workers not in (None, 1):
         raise CirlError(f"in this process there is one worker, not {workers}; use --on local")
     if on == "slurm":
         sbatch_options(settings or {})
-    for package, extra in EXTRAS.items():
-        if on == extra:
-            _capacity(package)
+    if on == "ray":
+        _ray()
 
 
 def place_of(on: str, folder: Path, workers: int | None, settings: Mapping[str, str]) -> Workplace | None:

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from cirl_marl.errors import CirlError, RunError
-from cirl_marl.jobs.work import EXIT_STOPPED, Work
+from cirl_marl.jobs.work import EXIT_STOPPED, Work, text_lines
 
 MINUTES = 24 * 60
 """Longest that a job may take unless something else is asked for; what is cut off goes on in another one."""
@@ -65,7 +65,7 @@ class Slurm:
             CirlError: if there is no Slurm here, or it does not take the settings.
         """
         options = sbatch_options(settings)
-        _run(["sbatch", "--test-only", *options, "--wrap", "true"], _refusal(settings))
+        _run(["sbatch", "--test-only", *options, "--wrap", "true"], settings_text(settings))
         folder.mkdir(parents=True, exist_ok=True)
         self._folder = Path(tempfile.mkdtemp(prefix=".slurm-", dir=folder))  # mode 700
         self._options = options
@@ -106,7 +106,7 @@ class SlurmJob:
             return None
         self._queue.forget(self._number)
         out = self._file.with_suffix(".out")
-        words = _lines(out.read_text(errors="replace"))[-1:] if out.is_file() else []
+        words = text_lines(out.read_text(errors="replace"))[-1:] if out.is_file() else []
         for file in (self._file, out):
             file.unlink(missing_ok=True)
         if state in CUT_OFF or state == f"FAILED {EXIT_STOPPED}":
@@ -214,11 +214,12 @@ def _run(command: Sequence[str], purpose: str, text: str = "", environment: Mapp
     except FileNotFoundError:
         raise CirlError(f"--on slurm: there is no Slurm here (no {command[0]}); use --on local") from None
     if answer.returncode:
-        raise CirlError(f"{purpose}: Slurm says: {(_lines(answer.stderr) or ['nothing'])[0]}")
+        raise CirlError(f"{purpose}: Slurm says: {(text_lines(answer.stderr) or ['nothing'])[0]}")
     return answer.stdout
 
 
-def _refusal(settings: Mapping[str, str]) -> str:
+def settings_text(settings: Mapping[str, str]) -> str:
+    """Return settings as they were given on the command line."""
     output = " ".join(f"{name}={value}" for name, value in settings.items())
     return f"--slurm {output}" if output else "--on slurm"
 
@@ -232,7 +233,3 @@ def _with_code(state: str, code: str) -> str:
     """Return a state, and of a failure the exit code or signal, which Slurm writes as ``code:signal``."""
     exit_code, _, signal = code.partition(":")
     return state if state != "FAILED" else f"FAILED by signal {signal}" if signal != "0" else f"FAILED {exit_code}"
-
-
-def _lines(text: str) -> list[str]:
-    return [line.strip() for line in text.splitlines() if line.strip()]

@@ -98,8 +98,7 @@ class JobFiles:
 
     def last_words(self) -> str:
         """Return the last line of the log; empty if there is none."""
-        text = self.log.read_text(errors="replace") if self.log.is_file() else ""
-        lines = [line.strip() for line in text.splitlines() if line.strip()]
+        lines = text_lines(self.log.read_text(errors="replace")) if self.log.is_file() else []
         return lines[-1] if lines else ""
 
 
@@ -162,6 +161,11 @@ def do(job: Job, files: JobFiles, listen: Callable[[], None]) -> None:
     except Exception as error:
         write_json(files.progress_file, progress | {"said": f"{type(error).__name__}: {error}"})
         raise
+
+
+def text_lines(text: str) -> list[str]:
+    """Return the lines of a text in which something stands."""
+    return [line.strip() for line in text.splitlines() if line.strip()]
 
 
 @contextmanager

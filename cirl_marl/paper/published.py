@@ -9,11 +9,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
+from typing import Annotated
 
 from pydantic import TypeAdapter
 
 from cirl_marl.definitions.reader import read_toml
 from cirl_marl.errors import CirlError, unknown_name
+from cirl_marl.network.declarations import frozen_record
 
 SOURCE = "Zocco, Corti, Malvezzi: CiRL, arXiv 2505.21536"
 HARDWARE = "Tesla T4"
@@ -22,21 +24,14 @@ GOAL_ALGORITHMS = ("DDPG-HER", "SAC-HER", "TD3-HER", "TQC-HER")
 ALGORITHMS = BOX_ALGORITHMS + GOAL_ALGORITHMS
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_record
 class PublishedRun:
-    """One run of the paper; None where its figure is not known.
+    """One run of the paper; None where its figure is not known."""
 
-    Attributes:
-        start_return: r_s, mean return of the first 100 training episodes.
-        end_return: r_e, mean return of the last 100.
-        time: training time on a Tesla T4.
-        success: s, share of evaluation episodes with a success, percent.
-    """
-
-    start_return: float | None = None
-    end_return: float | None = None
-    time: timedelta | None = None
-    success: float | None = None
+    start_return: Annotated[float | None, "r_s, mean return of the first 100 training episodes"] = None
+    end_return: Annotated[float | None, "r_e, mean return of the last 100"] = None
+    time: Annotated[timedelta | None, "training time on a Tesla T4"] = None
+    success: Annotated[float | None, "s, share of evaluation episodes with a success, percent"] = None
 
     @property
     def minutes(self) -> float | None:
@@ -52,25 +47,18 @@ class BestKnown:
     how: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_record
 class PaperEnvironment:
-    """One environment of the paper, in which every algorithm was trained for ``steps``.
-
-    Attributes:
-        success_episodes: evaluation episodes over which successes are counted; 0 if there is no success.
-        published_ends: whether the published class ends its episodes as ``legacy_episode=True`` does.
-        comparable: whether returns may be set against the paper's.
-        remark: in what the environment may differ from the published one; empty if in nothing.
-    """
+    """One environment of the paper, in which every algorithm was trained for ``steps``."""
 
     name: str
     steps: int
     runs: Mapping[str, PublishedRun]
     optima: tuple[BestKnown, ...] = ()
-    success_episodes: int = 0
-    published_ends: bool = False
-    comparable: bool = True
-    remark: str = ""
+    success_episodes: Annotated[int, "evaluation episodes over which successes count; 0 if there is no success"] = 0
+    published_ends: Annotated[bool, "whether the published class ends episodes as ``legacy_episode=True`` does"] = False
+    comparable: Annotated[bool, "whether returns may be set against the paper's"] = True
+    remark: Annotated[str, "in what the environment may differ from the published one; empty if in nothing"] = ""
 
     @property
     def id(self) -> str:

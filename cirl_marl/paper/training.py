@@ -5,9 +5,8 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium
 import numpy as np
@@ -25,6 +24,7 @@ from cirl_marl.learners.algorithms import build
 from cirl_marl.learners.demonstrations import demonstrate, in_copies
 from cirl_marl.learners.learner import derived_seed, wrap_in_normaliser
 from cirl_marl.learners.recipe import LearnerSettings, Normalisation
+from cirl_marl.network.declarations import frozen_record
 from cirl_marl.paper.published import PaperEnvironment
 from cirl_marl.paper.results import PaperRow
 from cirl_marl.paper.row_selection import tuned_recipe
@@ -35,26 +35,18 @@ Predict = Callable[[Any, Any, NDArray[np.bool_]], tuple[NDArray[Any], Any]]
 """From observations, recurrent state and episode starts to deterministic actions and the next recurrent state."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_record
 class TrainingRecord:
-    """What a training hands over to be measured.
+    """What a training hands over to be measured."""
 
-    Attributes:
-        predict: the final policy; None if its weights became NaN.
-        ends: environment steps at which each training episode ended.
-        returns: undiscounted return of each.
-        settings: what the row depends on.
-        options: of the environment to evaluate in.
-    """
-
-    predict: Predict | None
-    ends: list[int]
-    returns: list[float]
+    predict: Annotated[Predict | None, "the final policy; None if its weights became NaN"]
+    ends: Annotated[list[int], "environment steps at which each training episode ended"]
+    returns: Annotated[list[float], "undiscounted return of each"]
     steps: int
     seconds: float
     cpu_seconds: float
-    settings: dict[str, Any]
-    options: dict[str, Any]
+    settings: Annotated[dict[str, Any], "what the row depends on"]
+    options: Annotated[dict[str, Any], "of the environment to evaluate in"]
 
 
 def check_registered(environment: PaperEnvironment) -> gymnasium.envs.registration.EnvSpec:

@@ -22,7 +22,7 @@ from filelock import FileLock
 
 from cirl_marl.errors import RunError
 from cirl_marl.records.files import refuse_links, write_atomically, write_json, write_table
-from cirl_marl.sweeps.cells import Cell, CellJob
+from cirl_marl.sweeps.cells import Cell
 from cirl_marl.sweeps.reading import SweepFile
 
 INTERVALS = ("circularity", "service", "gap")
@@ -148,13 +148,6 @@ class SweepFolder:
 
 _ENVIRONMENT = {key: key for key in ("reward", "observe", "circularity_weight", "horizon", "uncertain")}
 _ENVIRONMENT |= {"circularity": "circularity_in_reward"}  # circularity itself is a result
-
-
-def jobs_of(
-    cells: Sequence[Cell], request: SweepFile, folder: SweepFolder, checkpoint_every: float | None
-) -> list[CellJob]:
-    """Return the work on the cells."""
-    return [CellJob(cell, folder.cell(cell.name), request.evaluation, checkpoint_every) for cell in cells]
 
 
 def _json(path: Path) -> dict[str, Any]:

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 from cirl_marl.jobs import Failure, Job, JobStatus, check_place, run_jobs
 from cirl_marl.network.declarations import positional_record
-from cirl_marl.sweeps.cells import Cell, cells_of
-from cirl_marl.sweeps.folder import SweepFolder, jobs_of
+from cirl_marl.sweeps.cells import Cell, CellJob, cells_of
+from cirl_marl.sweeps.folder import SweepFolder
 from cirl_marl.sweeps.fronts import FrontJob
 from cirl_marl.sweeps.reading import load_sweep
 
@@ -72,7 +72,8 @@ def sweep(
     cells = cells_of(request)
     folder = SweepFolder(Path("runs") / f"sweep-{path.stem}" if out is None else Path(out))
     folder.claim(request, cells)
-    work = {job.name: job for job in jobs_of(cells, request, folder, checkpoint_every)}
+    jobs_of_cells = [CellJob(cell, folder.cell(cell.name), request.evaluation, checkpoint_every) for cell in cells]
+    work = {job.name: job for job in jobs_of_cells}
     fronts = {cell.name: FrontJob.of(cell, folder.bounds) for cell in cells} if request.evaluation.bounds else {}
     rest = {fronts[name].name: fronts[name] for name, job in work.items() if name in fronts and not job.is_done()}
 
