@@ -37,8 +37,7 @@ class Pyramid:
     def mean_age(self) -> Floats:
         """At the start and after each interval, shape (steps + 1,), time; NaN of an empty stock."""
         total = self.mass.sum(axis=1)
-        mean: Floats = np.divide(self.mass @ self.ages, total, out=np.full(len(total), np.nan), where=total > 0)
-        return mean
+        return np.asarray(np.divide(self.mass @ self.ages, total, out=np.full(len(total), np.nan), where=total > 0))
 
 
 def pyramids(network: Network, run: Rollout, start: Floats) -> list[Pyramid]:

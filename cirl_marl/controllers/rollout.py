@@ -58,26 +58,22 @@ class Rollout:
     @property
     def episode_circularity(self) -> Floats:
         """λ̄ of each episode, shape (B,), mass."""
-        mean: Floats = self.circularity_mean.mean(axis=1)
-        return mean
+        return np.asarray(self.circularity_mean.mean(axis=1))
 
     @property
     def episode_service(self) -> Floats:
         """Mean of the services' levels in each episode, shape (B,)."""
-        mean: Floats = self.service.mean(axis=1)
-        return mean
+        return np.asarray(self.service.mean(axis=1))
 
     @property
     def episode_levels(self) -> Floats:
         """Mean level of each service in each episode, shape (B, services)."""
-        mean: Floats = self.levels.mean(axis=2)
-        return mean
+        return np.asarray(self.levels.mean(axis=2))
 
     @property
     def least_service(self) -> Floats:
         """Mean level of the service that lacks most in each episode, shape (B,); 1 without services."""
-        least: Floats = self.episode_levels.min(axis=1, initial=1.0)
-        return least
+        return np.asarray(self.episode_levels.min(axis=1, initial=1.0))
 
 
 def rollout(

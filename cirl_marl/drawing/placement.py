@@ -38,8 +38,7 @@ def place_nodes(network: Network, pitch: Floats, aspect: float) -> Floats:
     small = 2 < len(network.nodes) <= SEARCHED_NODES and len(edges) <= SEARCHED_EDGES
     cells = _Search(network, edges, pitch, aspect).best(layers) if small else layers
     cells = _without_gaps(cells)
-    positions: Floats = cells * _pitch(cells, pitch, aspect) * np.array([1.0, -1.0])
-    return positions
+    return np.asarray(cells * _pitch(cells, pitch, aspect) * np.array([1.0, -1.0]))
 
 
 def _pitch(cells: Floats, pitch: Floats, aspect: float) -> Floats:
@@ -206,8 +205,7 @@ class _Search:
         first_arm, second_arm = points[:, first] - points[:, hub], points[:, second] - points[:, hub]
         norm = np.hypot(*np.moveaxis(first_arm, -1, 0)) * np.hypot(*np.moveaxis(second_arm, -1, 0))
         cosine = (first_arm * second_arm).sum(axis=-1) / np.maximum(norm, 1e-12)
-        narrow: Floats = np.maximum(cosine - 0.8, 0) * 5
-        return narrow
+        return np.asarray(np.maximum(cosine - 0.8, 0) * 5)
 
 
 def _cross(a: Floats, b: Floats, c: Floats, d: Floats) -> NDArray[np.bool_]:

@@ -44,8 +44,7 @@ class ComparedQuantity:
     @property
     def differences(self) -> Floats:
         """Differences to the first alternative, shape (A,), in the unit of the values; NaN where one is missing."""
-        difference: Floats = self.values - self.values[0]
-        return difference
+        return np.asarray(self.values - self.values[0])
 
     @property
     def relative_differences(self) -> Floats:

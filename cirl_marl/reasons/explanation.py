@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -124,32 +125,21 @@ def _explain_run(
 
     recorder = Recorder(policies)
     usual = play_episodes(env, recorder, seed, report("episodes"))
-    prices: ShadowPrices | None = None
-    inputs: tuple[AgentInputs, ...] = ()
-    rules: TeamRules | None = None
-    no_prices = ""
+    explanation = Explanation(
+        network=env.network, about=str(run.path), checkpoint=policies.checkpoint.name, episodes=episodes
+    )
     if "prices" in parts:
         level = levels_to_demand(usual.episode_levels.mean(axis=0)) if min_service is None else min_service
-        progress_of_prices = report("shadow prices")
+        options: dict[str, Any] = {"agents": env.agents, "progress": report("shadow prices")}
         try:
-            prices = shadow_prices(
-                env.network, start, min_service=level, agents=env.agents, progress=progress_of_prices
-            )
+            explanation = replace(explanation, prices=shadow_prices(env.network, start, min_service=level, **options))
         except NoCertificate as missing:
-            no_prices = str(missing)
+            explanation = replace(explanation, no_prices=str(missing))
     if "inputs" in parts:
-        record, twins = recorder.episodes, Trained(run)
-        report_inputs = report("what agents look at")
+        record, twins, report_inputs = recorder.episodes, Trained(run), report("what agents look at")
         inputs = attribute_inputs(env, policies, twins, record, usual, seed, top=top, progress=report_inputs)
+        explanation = replace(explanation, inputs=inputs)
     if "rules" in parts:
         rules = distil_rules(env, policies, usual, seed, leaves=leaves, progress=report("rules"))
-    return Explanation(
-        network=env.network,
-        about=str(run.path),
-        checkpoint=policies.checkpoint.name,
-        episodes=episodes,
-        prices=prices,
-        no_prices=no_prices,
-        inputs=inputs,
-        rules=rules,
-    )
+        explanation = replace(explanation, rules=rules)
+    return explanation

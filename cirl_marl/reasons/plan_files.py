@@ -172,8 +172,7 @@ def _carry_out(network: Network, table: _Table, seed: int | None) -> PlannedEpis
 
 def _stocks(env: MultiAgentVectorEnv) -> Floats:
     """Return the stocks of the only copy, shape (stocks,), as the simulator has them."""
-    stocks: Floats = env.physical.stock[env.rows.nodes][:, 0].copy()
-    return stocks
+    return np.asarray(env.physical.stock[env.rows.nodes][:, 0].copy())
 
 
 def _episodes_of_run(run: RunDirectory, seed: int, count: int) -> list[PlannedEpisode]:

@@ -258,8 +258,7 @@ def _moving_average(values: Floats, window: int) -> Floats:
     finite = np.isfinite(values)
     weights = np.ones(2 * (window // 2) + 1)
     total, count = (np.convolve(terms, weights, "same") for terms in (np.where(finite, values, 0.0), finite))
-    mean: Floats = np.divide(total, count, out=np.full(len(values), np.nan), where=count > 0)
-    return mean
+    return np.asarray(np.divide(total, count, out=np.full(len(values), np.nan), where=count > 0))
 
 
 def _draw_largest(axes: Axes, time: Floats, values: Floats, names: Sequence[str], title: str, unit: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -185,17 +186,7 @@ def _diagram(diagram: FlowDiagram) -> Values:
         }
         for name, layout in diagram.layouts.items()
     }
-    boxes = [
-        {
-            "label": box.label,
-            "members": list(box.members),
-            "role": box.role.value,
-            "stores": box.stores,
-            "opens": box.opens,
-        }
-        for box in diagram.boxes
-    ]
-    ribbons = [{"members": list(r.members), "donor": r.donor, "recipient": r.recipient} for r in diagram.ribbons]
+    boxes, ribbons = ([asdict(part) for part in parts] for parts in (diagram.boxes, diagram.ribbons))
     return {"group": diagram.group, "caption": diagram.caption, "boxes": boxes, "ribbons": ribbons, "ways": layouts}
 
 

@@ -189,8 +189,7 @@ def _first_start(comparison: Comparison) -> Floats:
     """Return the stocks with which the first episode begins, shape (stores,), mass."""
     env = MultiAgentVectorEnv(comparison.network, num_envs=1, agents=comparison.agents)
     env.reset(seed=comparison.first_seed)
-    start: Floats = env.rows.stocks(env.physical.stock)[:, 0].copy()
-    return start
+    return np.asarray(env.rows.stocks(env.physical.stock)[:, 0].copy())
 
 
 def _episode(
