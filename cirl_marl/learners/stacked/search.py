@@ -33,14 +33,12 @@ class SearchStack(Stack):
     def __init__(self, members: Sequence[Learner], device: str = "cpu") -> None:
         """Take over parameters, counters and streams of the learners."""
         super().__init__(members, device)
-        self._models = [_ars_model(member) for member in members]
         first = self._models[0]
         self._layout = ParameterLayout(len(members))
-        policies = [_policy(model) for model in self._models]
-        parts = [parts_of(policy) for policy in policies]
+        parts = [parts_of(model.policy) for model in self._models]
         self._fields = self._layout.layers([[*linear, head] for linear, head, _ in parts], self._inputs.actor_columns)
-        self._activation: Activation = parts[0][2]
-        self._squashes = policies[0].squash_output
+        self._activation = parts[0][2]
+        self._squashes = first.policy.squash_output
         self._centre = torch.zeros(len(members), self._layout.columns, device=self._device)
         for i in range(len(members)):
             for parameter, columns in self._layout.places(i):
@@ -52,7 +50,8 @@ class SearchStack(Stack):
         self._rows, self._copies = agent_env.num_envs, agent_env.copies
         self._copies_per_candidate = copies_per_candidate(members[0])
         # the algorithm counts a step of all its rows once for each of them
-        self._before, self._updates = first.num_timesteps // self._rows**2, first._n_updates
+        self._before: int = first.num_timesteps // self._rows**2
+        self._updates: int = first._n_updates
 
     def learn(self, steps: int, wait: Callable[[], None]) -> None:
         """Learn for the share of ``steps`` that is the learners'; ``wait`` returns when the environments have moved.
@@ -93,7 +92,7 @@ class SearchStack(Stack):
         for i, model in enumerate(self._models):
             vector = self._centre[i, self._columns[i]].cpu()
             model.policy.load_from_vector(vector.numpy())
-            model.weights = vector  # type: ignore[assignment]
+            model.weights = vector
             model.num_timesteps, model._n_updates = self._steps * self._rows**2, self._updates
 
     def _draw_directions(self) -> Tensor:
@@ -178,7 +177,8 @@ def copies_per_candidate(learner: Learner) -> int:
     Raises:
         ValueError: if candidates do not fill the copies evenly.
     """
-    model, agent_env = _ars_model(learner), learner.agent_env
+    model, agent_env = learner.model, learner.agent_env
+    assert isinstance(model, ARS)
     agents = agent_env.num_envs // agent_env.copies
     count, remainder = divmod(model.n_eval_episodes, agents)
     if remainder or not count or agent_env.copies % count or model.pop_size % (agent_env.copies // count):
@@ -187,13 +187,3 @@ def copies_per_candidate(learner: Learner) -> int:
             f"do not fill {agent_env.copies} copies with {agents} rows evenly"
         )
     return count
-
-
-def _ars_model(learner: Learner) -> ARS:
-    assert isinstance(learner.model, ARS)
-    return learner.model
-
-
-def _policy(model: ARS) -> ARSPolicy:
-    assert isinstance(model.policy, ARSPolicy)
-    return model.policy

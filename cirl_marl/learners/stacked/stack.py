@@ -39,7 +39,7 @@ class StackedInputs:
         """Lay out the inputs and take over the moments of the normalisers."""
         self._members, self._device = members, device
         views = [learner.agent_env.view for learner in members]
-        self.spaces = [_box(view.action_space) for view in views]
+        self.spaces: list[Any] = [view.action_space for view in views]
         rows, states = members[0].agent_env.num_envs, views[0].state_entries
         lengths = [spaces.flatdim(view.observation_space) - states for view in views]
         self.local, self.entries = max(lengths), max(lengths) + states
@@ -146,11 +146,6 @@ def _update(moments: RunningMeanStd, samples: NDArray[np.floating]) -> None:
     moments.update_from_moments(samples.mean(axis=1), samples.var(axis=1), samples.shape[1])
 
 
-def _box(space: spaces.Space[Any]) -> spaces.Box:
-    assert isinstance(space, spaces.Box)
-    return space
-
-
 class Stack(ABC):
     """Learners of the same settings, from which it takes everything and to which ``give`` brings it back.
 
@@ -161,6 +156,7 @@ class Stack(ABC):
     def __init__(self, members: Sequence[Learner], device: str = "cpu") -> None:
         """Take over the inputs and the torch streams of the learners."""
         self.members = list(members)
+        self._models: list[Any] = [member.model for member in members]
         self._device = torch.device(device)
         self._inputs = StackedInputs(members, self._device)
         # Noise comes from a copy of each learner's torch stream.
