@@ -221,7 +221,8 @@ def lone_seat(env: FreeEnv, agent: str) -> AgentVecEnv:
         paid = env.reward(agent, step).astype(np.float32)
         agent_env.last_step = StepResult(seen, paid, env.ended(step), seen, nothing, nothing.astype(int))
 
-    agent_env = AgentVecEnv(env, agent, OneAgent(env, agent), wait)
+    agent_env = AgentVecEnv(env, agent, OneAgent(env, agent))
+    agent_env.wait = wait
     ready = np.zeros(env.num_envs, dtype=np.float32), np.ones(env.num_envs, dtype=bool)
     agent_env.last_step = StepResult(env.observation(agent, 0), *ready)
     return agent_env

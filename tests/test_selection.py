@@ -19,7 +19,7 @@ from cirl_marl.evaluation.assessment import acting_checkpoint
 from cirl_marl.learners import RunDirectory, resume, train
 from cirl_marl.learners.interface import Trained
 from cirl_marl.learners.recipe import LearnerSettings, Recipe, Run
-from cirl_marl.learners.validation import FIRST_SEED, LARGEST_MULTIPLIER, Score, ServiceMultiplier, ValidationEpisodes
+from cirl_marl.learners.validation import FIRST_SEED, LARGEST_MULTIPLIER, Score, ServiceMultiplier, validation_score
 
 HORIZON, STEPS = 6, 96
 
@@ -188,13 +188,11 @@ def test_an_evaluation_has_episodes_of_its_own() -> None:
     env = MultiAgentVectorEnv("copper_net", num_envs=2, horizon=HORIZON)
     from cirl_marl.learners.policies import Policies
 
-    evaluation = ValidationEpisodes(env)
-
     class Still(Policies):
         def act(self, observations: Any) -> Any:
             return {agent: np.zeros((2, 1)) for agent in env.agents}
 
-    first, again = (evaluation.score(Still({})) for _ in range(2))
+    first, again = (validation_score(env, Still({})) for _ in range(2))
     assert first == again
     reported = rollout(env, Still({}))
     assert float(reported.episode_circularity.mean()) != first.circularity

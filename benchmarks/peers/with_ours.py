@@ -8,10 +8,11 @@ from unittest.mock import patch
 from benchmarks.peers.problem import Scaling
 from benchmarks.peers.settings import NETWORK, SETTINGS
 from benchmarks.peers.watch import TimeIsUp, Watch
-from cirl_marl.learners import Recipe, load_recipe, train
+from cirl_marl.environments.vector import MultiAgentVectorEnv
+from cirl_marl.learners import Recipe, load_recipe, train, trainer
 from cirl_marl.learners.policies import Policies
 from cirl_marl.learners.trainer import Progress
-from cirl_marl.learners.validation import Score, ValidationEpisodes
+from cirl_marl.learners.validation import Score, validation_score
 
 EVALUATIONS = 20
 """At which policies are judged whose recipe has none."""
@@ -51,10 +52,10 @@ def _learn(watch: Watch, recipe: Recipe, engine: str, seed: int) -> None:
     run = recipe.run
     versions = {name: version(name) for name in ("cirl-marl", "stable-baselines3", "torch")}
     watch.record.setup = {"envs": run.envs, "threads": 1, "recipe": recipe.name, "engine": engine, **versions}
-    score, steps = ValidationEpisodes.score, 0
+    steps = 0
 
-    def judged(selection: ValidationEpisodes, policies: Policies) -> Score:
-        found = score(selection, policies)
+    def judged(env: MultiAgentVectorEnv, policies: Policies) -> Score:
+        found = validation_score(env, policies)
         watch.judge(policies, steps)
         return found
 
@@ -69,7 +70,7 @@ def _learn(watch: Watch, recipe: Recipe, engine: str, seed: int) -> None:
     if watch.judges and not run.evaluations:
         run = run.model_copy(update={"evaluations": EVALUATIONS, "episodes": 1})
     try:
-        with patch.object(ValidationEpisodes, "score", judged if watch.judges else score):
+        with patch.object(trainer, "validation_score", judged if watch.judges else validation_score):
             train(NETWORK, recipe.model_copy(update={"run": run}), seed=seed, engine=engine, report=report)
     except TimeIsUp:
         return

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
+from greenlet import getcurrent
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvObs, VecEnvStepReturn
 
@@ -16,6 +17,11 @@ from cirl_marl.errors import CirlError
 from cirl_marl.learners.views import ObservedRows, View, by_part, rows_of
 from cirl_marl.network import Floats
 from cirl_marl.network.elements import Compartment
+
+
+def wait() -> None:
+    """Leave a learner's coroutine until every learner has acted and the joint step is done."""
+    getcurrent().parent.switch()
 
 
 class BatchedEnv(Protocol):
@@ -139,27 +145,18 @@ class AgentVecEnv(VecEnv):
         name: of the learner; an independent learner has its agent's.
         last_step: the outcome of the last joint step.
         action: its last one.
+        wait: returns when every learner has handed in its actions and the joint environment has moved.
         bootstrap: whether time limits are reported as truncations, after which the learner expects more to come.
     """
 
-    def __init__(
-        self,
-        env: BatchedEnv,
-        name: str,
-        view: View,
-        wait: Callable[[], object],
-        row: Callable[..., Any] = AgentInNetworkCopy,
-    ) -> None:
-        """Show ``env`` by ``view``; ``wait`` returns when every learner has acted and the environment has moved.
-
-        ``row`` makes the environment of one row, which ``env_method`` and ``get_attr`` reach: of copy and agent.
-        """
+    def __init__(self, env: BatchedEnv, name: str, view: View, row: Callable[..., Any] = AgentInNetworkCopy) -> None:
+        """Show ``env`` by ``view``; ``row`` makes what ``env_method`` and ``get_attr`` reach: of copy and agent."""
         self.name, self.view, self.copies = name, view, env.num_envs
         self.last_step: StepResult = _NO_STEP
         self.action: NDArray[np.float32] | None = None
         self.bootstrap = True
         self.views = [row(env, i, agent) for agent in view.row_agents or (None,) for i in range(self.copies)]
-        self._wait = wait
+        self.wait: Callable[[], object] = wait
         super().__init__(len(self.views), view.observation_space, view.action_space)
 
     @property
@@ -209,7 +206,7 @@ class AgentVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Wait until every learner has handed in its actions and the joint environment has moved."""
-        self._wait()
+        self.wait()
         rewards, dones = self.rewards_and_dones()
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         now = self.last_step

@@ -36,24 +36,21 @@ class CheckpointBarrier:
     """The barrier of one learner.
 
     Attributes:
+        write: writes the state to a folder, with what else belongs to it; None if the run is kept nowhere.
         folder: where a checkpoint is requested; None if none is.
         log: steps since the learner wrote its state for that checkpoint; None if it has not.
         replay_log: steps that a resumed learner has still to repeat.
     """
 
     def __init__(self, agent_env: AgentVecEnv) -> None:
-        """Of the learner in ``agent_env``; ``write_with`` says how it is saved."""
+        """Of the learner in ``agent_env``."""
         self._agent_env = agent_env
-        self._write: Callable[[Path, dict[str, Any]], None] | None = None
+        self.write: Callable[[Path, dict[str, Any]], None] | None = None
         self._load: Callable[[], None] | None = None
         self._acting_state: Mapping[str, Any] | None = None
         self.folder: Path | None = None
         self.log: list[LoggedStep] | None = None
         self.replay_log: list[LoggedStep] = []
-
-    def write_with(self, write: Callable[[Path, dict[str, Any]], None]) -> None:
-        """Have the state written by ``write``, which takes the folder and what else belongs to the state."""
-        self._write = write
 
     def resume_from(self, load: Callable[[], None], step: StepResult, acting_state: Mapping[str, Any] | None) -> None:
         """Have ``load`` bring the learner into its saved state at the first barrier, where ``step`` was its last."""
@@ -79,9 +76,9 @@ class CheckpointBarrier:
         if self._load is not None:
             load, self._load = self._load, None
             load()
-        if self.folder is not None and self.log is None and self._write is not None:
+        if self.folder is not None and self.log is None and self.write is not None:
             self.log = []
-            self._write(self.folder, {"handed": self._agent_env.last_step.state_dict(), "acting": acting_state})
+            self.write(self.folder, {"handed": self._agent_env.last_step.state_dict(), "acting": acting_state})
 
     def record(self) -> None:
         """Log the last step, if the learner has written its state."""

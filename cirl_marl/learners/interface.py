@@ -23,7 +23,7 @@ from cirl_marl.errors import CirlError, RecipeError, RunError, unknown_name
 from cirl_marl.learners.agent_env import AgentVecEnv
 from cirl_marl.learners.algorithms import has_replay_buffer
 from cirl_marl.learners.learner import Learner, load_acting_learner
-from cirl_marl.learners.lockstep import global_streams_claimed, wait
+from cirl_marl.learners.lockstep import global_streams_claimed
 from cirl_marl.learners.policies import Policies
 from cirl_marl.learners.recipe import ENGINES, OPTIONS, Recipe, load_recipe
 from cirl_marl.learners.run_directory import RunConfig, RunDirectory
@@ -335,9 +335,7 @@ def export(run: str | Path | RunDirectory, folder: str | Path) -> list[Path]:
     env, files = source.make_env(source.config.envs), list[Path]()
     with publish_folder(target) as partial:
         for group in source.groups():
-            learner = Learner(
-                AgentVecEnv(env, group.name, group.view(env), wait), group.spec, source.config.seed
-            ).build()
+            learner = Learner(AgentVecEnv(env, group.name, group.view(env)), group.spec, source.config.seed).build()
             learner.take(source.acting_checkpoint).model.save(partial / f"{group.name}.zip")
             files.append(target / f"{group.name}.zip")
             if learner.normaliser is not None:

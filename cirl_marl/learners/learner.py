@@ -39,7 +39,7 @@ from cirl_marl.learners.checkpoint import (
     write_tree,
 )
 from cirl_marl.learners.demonstrations import Demonstrator, demonstrate, keep_parameters, steps_counted
-from cirl_marl.learners.lockstep import BudgetSpent, Streams, wait
+from cirl_marl.learners.lockstep import BudgetSpent, Streams
 from cirl_marl.learners.policies import Policy
 from cirl_marl.learners.recipe import Group, LearnerSettings
 
@@ -331,7 +331,7 @@ def load_acting_learner(folder: Path, group: Group, env: MultiAgentVectorEnv) ->
     if has_replay_buffer(group.spec.algorithm):
         parameters["buffer_size"] = 1
     spec = group.spec.model_copy(update={"parameters": parameters})
-    return Learner(AgentVecEnv(env, group.name, group.view(env), wait), spec, 0).build().take(folder)
+    return Learner(AgentVecEnv(env, group.name, group.view(env)), spec, 0).build().take(folder)
 
 
 def wrap_in_normaliser(env: VecEnv, spec: LearnerSettings, keys: list[str] | None = None) -> VecEnv:

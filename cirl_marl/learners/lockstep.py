@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from greenlet import GreenletExit, getcurrent, greenlet
+from greenlet import GreenletExit, greenlet
 from numpy.random.mtrand import get_bit_generator, set_bit_generator
 from numpy.typing import NDArray
 from stable_baselines3.common.utils import set_random_seed
@@ -44,6 +44,7 @@ class Streams:
 
     Attributes:
         torch_state: of the torch stream, while it is not active.
+        bit_generator: the NumPy stream itself, while it is not active; who draws from it moves it on.
     """
 
     def __init__(self, seed: int | None = None, *, keep_gaussian: bool = False) -> None:
@@ -58,22 +59,17 @@ class Streams:
             torch.set_grad_enabled(True)
             self._leave()
 
-    @property
-    def bit_generator(self) -> np.random.BitGenerator:
-        """The NumPy stream itself, while it is not active; who draws from it moves it on."""
-        return self._numpy
-
     def state_dict(self, *, active: bool) -> dict[str, Any]:
         """Return the state of the streams, which are the ``active`` ones or put away."""
         if active:
             self._leave()
-        numpy = self._numpy.state if self._numpy_state is None else self._numpy_state
+        numpy = self.bit_generator.state if self._numpy_state is None else self._numpy_state
         return {"torch": self.torch_state, "numpy": numpy, "gaussian": self._numpy_state is not None}
 
     def load_state_dict(self, state: Mapping[str, Any], *, active: bool) -> None:
         """Bring the streams into a state."""
         self.torch_state, numpy = state["torch"], state["numpy"]
-        self._numpy.state = {"bit_generator": numpy["bit_generator"], "state": numpy["state"]}
+        self.bit_generator.state = {"bit_generator": numpy["bit_generator"], "state": numpy["state"]}
         self._numpy_state = numpy if state["gaussian"] else None
         if active:
             self._enter()
@@ -96,13 +92,13 @@ class Streams:
     def _leave(self) -> None:
         self.torch_state = torch.get_rng_state()
         self._grad = torch.is_grad_enabled()
-        self._numpy = get_bit_generator()
+        self.bit_generator = get_bit_generator()
         self._numpy_state = np.random.get_state(legacy=False) if self.keep_gaussian else None  # noqa: NPY002 (Stable-Baselines3 draws from it)
 
     def _enter(self) -> None:
         torch.set_rng_state(self.torch_state)
         torch.set_grad_enabled(self._grad)
-        set_bit_generator(self._numpy)
+        set_bit_generator(self.bit_generator)
         if self._numpy_state is not None:
             np.random.set_state(self._numpy_state)  # noqa: NPY002
 
@@ -139,11 +135,6 @@ class BudgetSpent(GreenletExit):  # type: ignore[misc]
 
 class TrainingStop(Exception):
     """Raised to end training early; what was learnt is kept."""
-
-
-def wait() -> None:
-    """Leave a learner's coroutine until the joint step is done."""
-    getcurrent().parent.switch()
 
 
 class World:
@@ -223,9 +214,7 @@ class NetworkWorld(World):
         ``views`` are what each learner sees, by its name; None gives every agent a learner of its own.
         """
         views = views if views is not None else {agent: OneAgent(env, agent) for agent in env.agents}
-        super().__init__(
-            env, seeds, {name: AgentVecEnv(env, name, view, wait) for name, view in views.items()}, done=done
-        )
+        super().__init__(env, seeds, {name: AgentVecEnv(env, name, view) for name, view in views.items()}, done=done)
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that a world is resumed from, but for its learners."""

@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.environments.vector import MultiAgentVectorEnv
+from cirl_marl.learners.checkpoint import observation_statistics
 from cirl_marl.learners.views import View, unseen_state
 
 
@@ -28,40 +29,34 @@ class Policy:
 
 
 class Policies(Controller):
-    """Trained policies as a controller: all act deterministically, and the moments of normalisers stay as they are."""
+    """Trained policies as a controller: all act deterministically, and the moments of normalisers stay as they are.
+
+    Attributes:
+        policies: by the names of their learners; together they act for every agent once.
+        memory: what each remembers, as its algorithm has it; None of those that remember nothing, or have not acted.
+    """
 
     def __init__(self, policies: Mapping[str, Policy]) -> None:
-        """``policies`` are those of the learners, by name; together they act for every agent once."""
-        self._policies = policies
-        self._memory: dict[str, Any] = {}
-        self._starts = np.ones(1, dtype=bool)
-
-    @property
-    def policies(self) -> Mapping[str, Policy]:
-        """The policies, by the names of their learners."""
-        return self._policies
-
-    @property
-    def memory(self) -> Mapping[str, Any]:
-        """What each remembers, as its algorithm has it; None of those that remember nothing, or have not acted yet."""
-        return self._memory
+        """Act by ``policies``."""
+        self.policies = policies
+        self.memory: dict[str, Any] = {}
 
     def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Forget the last episode."""
-        self._memory = dict.fromkeys(self._policies)
+        self.memory = dict.fromkeys(self.policies)
         self._starts = np.ones(env.num_envs, dtype=bool)
         self._state = unseen_state(env)
 
     def act(self, observations: Arrays) -> Arrays:
         """Return each policy's deterministic action, which depends on the observations of its agents alone."""
         actions: dict[str, NDArray[np.floating]] = {}
-        for name, policy in self._policies.items():
+        for name, policy in self.policies.items():
             view = policy.view
             rows = view.observe(observations, self._state)
             if policy.normaliser is not None:
                 rows = policy.normaliser.normalize_obs(rows)
             starts = np.tile(self._starts, max(1, len(view.row_agents)))
-            action, self._memory[name] = policy.model.predict(rows, self._memory[name], starts, deterministic=True)
+            action, self.memory[name] = policy.model.predict(rows, self.memory[name], starts, deterministic=True)
             actions.update(view.act(action))
         self._starts = np.zeros_like(self._starts)
         return actions
@@ -81,10 +76,8 @@ class DifferentiablePolicy(torch.nn.Module):
         self._policy.set_training_mode(False)
         normaliser = policy.normaliser
         self._normaliser: tuple[torch.Tensor, torch.Tensor, float] | None = None
-        if normaliser is not None and normaliser.norm_obs:
-            statistics: Any = normaliser.obs_rms
-            if isinstance(statistics, dict):
-                statistics = statistics.get("observation")
+        if normaliser is not None:
+            statistics = observation_statistics(normaliser).get("observation")
             if statistics is not None:
                 spread = (torch.as_tensor(statistics.var) + normaliser.epsilon).sqrt()
                 self._normaliser = torch.as_tensor(statistics.mean), spread, normaliser.clip_obs

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import (
     BaseModel,
@@ -31,7 +31,7 @@ from cirl_marl.network import Network
 from cirl_marl.network.elements import Moment, Node, Observe, Reward, Role
 
 EngineName = Literal["auto", "lockstep", "stacked"]
-ENGINES: tuple[EngineName, ...] = ("auto", "lockstep", "stacked")
+ENGINES: tuple[EngineName, ...] = get_args(EngineName)
 Count = Annotated[int, Field(strict=True, gt=0)]
 Limit = Annotated[Number, Field(gt=0)]
 

@@ -24,13 +24,13 @@ from cirl_marl.errors import CirlError, RecipeError, RunError, unknown_name
 from cirl_marl.learners.checkpoint import read_tree, write_tree
 from cirl_marl.learners.demonstrations import Demonstrator
 from cirl_marl.learners.learner import Learner, derived_seed, has_tensorboard
-from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, Streams, TrainingStop, wait
+from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, Streams, TrainingStop
 from cirl_marl.learners.policies import Policies
 from cirl_marl.learners.run_directory import RunConfig, RunDirectory, TableFile, steps_of
 from cirl_marl.learners.stacked.conditions import obstacle, stacks
 from cirl_marl.learners.stacked.stack import Stack
 from cirl_marl.learners.start import begin_again, begin_from
-from cirl_marl.learners.validation import MULTIPLIER_FROM, Score, ServiceMultiplier, ValidationEpisodes
+from cirl_marl.learners.validation import MULTIPLIER_FROM, Score, ServiceMultiplier, validation_score
 
 CHECKPOINTS = 10
 """Checkpoints of a run, evenly spaced."""
@@ -122,12 +122,11 @@ class Training:
             self.world.load_state_dict(self._saved_state["world"])
         self._multiplier = self._service_multiplier(checkpoint)
         run_settings = config.recipe.run
-        self._evaluation: ValidationEpisodes | None = None
+        self._validation_env: MultiAgentVectorEnv | None = None
         if run_settings.evaluations:
-            validation_env = MultiAgentVectorEnv(
+            self._validation_env = MultiAgentVectorEnv(
                 env.network, num_envs=run_settings.episodes, agents=env.agents, **config.options
             )
-            self._evaluation = ValidationEpisodes(validation_env)
         self._last_evaluation = -1
         self._checkpoint_folder: Path | None = None
         self._stack_names: Container[str] = ()
@@ -168,7 +167,7 @@ class Training:
         self._metrics = TableFile(run.path / "metrics.csv", columns, self.done)
         self._saved_at = time.monotonic()
         for name, learner in self.learners.items():
-            learner.barrier.write_with(partial(self._write_learner, learner))
+            learner.barrier.write = partial(self._write_learner, learner)
             if has_tensorboard():
                 learner.log_to_tensorboard(run.path / "tensorboard" / name)
         best = run.status["best"]
@@ -242,17 +241,17 @@ class Training:
                 total_seconds = seconds + self._metrics.last.get("seconds", 0.0)
                 self._metrics.append([steps, steps * copies, total_seconds, circularity, service, *returns])
         total_steps = self.config.steps // copies
-        if self._evaluation is not None:
+        if self.config.recipe.run.evaluations:
             interval = max(self.env.network.episode.horizon, total_steps // self.config.recipe.run.evaluations)
             if steps % interval == 0:
-                self._evaluate(self._evaluation)
+                self._evaluate()
         if steps % max(1, total_steps // CHECKPOINTS) == 0:
             self._due = True
 
     def finish(self) -> None:
         """Evaluate what was learnt in the end, and keep it."""
-        if self._evaluation is not None and self._last_evaluation != self.joint_steps:
-            self._evaluate(self._evaluation)
+        if self._last_evaluation != self.joint_steps:
+            self._evaluate()
         self._bring_up_to_date()
         if self.run is not None:
             partial_folder = self.run.begin_checkpoint()
@@ -317,11 +316,13 @@ class Training:
         learner.write_state(folder, more, in_stack=learner.name in self._stack_names)
         self._checkpoint_seconds += time.perf_counter() - began
 
-    def _evaluate(self, evaluation: ValidationEpisodes) -> None:
-        """Play its episodes by the policies of now, keep these if they are the best so far, and move the multiplier."""
+    def _evaluate(self) -> None:
+        """Validate the policies of now, keep them if they are the best so far, and move the multiplier."""
+        if self._validation_env is None:
+            return
         self._bring_up_to_date()
         policies = Policies({name: learner.policy for name, learner in self.learners.items()})
-        score, target = evaluation.score(policies), self.config.recipe.run.min_service
+        score, target = validation_score(self._validation_env, policies), self.config.recipe.run.min_service
         self._last_evaluation = self.joint_steps
         better = self._best is None or score.rank(target) > self._best.rank(target)
         if better:
@@ -439,8 +440,8 @@ def _participants(
         title = ", ".join(titles[:3] + ["…"] * (len(titles) > 3))
         yield Participant(
             f"the stack of {title}",
-            partial(stack.learn, steps, wait),
-            partial(stack.act, wait),
+            partial(stack.learn, steps),
+            stack.act,
             Streams(),
             [member.barrier for member in stack.members],
         )

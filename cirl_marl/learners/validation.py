@@ -63,31 +63,24 @@ class Score:
         return {self.NAMES_IN_FILES.get(name, name): getattr(self, name) for name in self.__slots__}
 
     @classmethod
-    def from_figures(cls, figures: Mapping[str, float] | None) -> Score | None:
-        """Return the score of figures that were written to a file; None if there is none."""
+    def from_figures(cls, figures: Mapping[str, float]) -> Score:
+        """Return the score of figures that were written to a file."""
         names = {key: name for name, key in cls.NAMES_IN_FILES.items()}
-        return None if figures is None else cls(**{names.get(key, key): value for key, value in figures.items()})
+        return cls(**{names.get(key, key): value for key, value in figures.items()})
 
 
-class ValidationEpisodes:
-    """The episodes that choose: the same ones each time, each in a copy of the environment of its own."""
-
-    def __init__(self, env: MultiAgentVectorEnv) -> None:
-        """``env`` has a copy for each episode, and is used by nobody else."""
-        self._env = env
-
-    def score(self, policies: Policies) -> Score:
-        """Play the episodes by deterministic policies; training is not touched."""
-        run = rollout(self._env, policies, seed=FIRST_SEED)
-        levels = run.episode_levels
-        spread = levels.std(axis=0, ddof=1) if len(levels) > 1 else np.zeros(levels.shape[1])
-        lower_bounds = levels.mean(axis=0) - QUANTILE_95 * spread / math.sqrt(len(levels))
-        return Score(
-            circularity=float(run.episode_circularity.mean()),
-            service=float(levels.mean(axis=0).min(initial=1.0)),
-            service_bound=float(lower_bounds.min(initial=1.0)),
-            episode_return=float(run.returns.sum(axis=0).mean()),
-        )
+def validation_score(env: MultiAgentVectorEnv, policies: Policies) -> Score:
+    """Play the episodes that choose, the same ones each time; ``env`` has a copy for each and is nobody else's."""
+    run = rollout(env, policies, seed=FIRST_SEED)
+    levels = run.episode_levels
+    spread = levels.std(axis=0, ddof=1) if len(levels) > 1 else np.zeros(levels.shape[1])
+    lower_bounds = levels.mean(axis=0) - QUANTILE_95 * spread / math.sqrt(len(levels))
+    return Score(
+        circularity=float(run.episode_circularity.mean()),
+        service=float(levels.mean(axis=0).min(initial=1.0)),
+        service_bound=float(lower_bounds.min(initial=1.0)),
+        episode_return=float(run.returns.sum(axis=0).mean()),
+    )
 
 
 MULTIPLIER_FROM = 0.5

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -119,8 +119,8 @@ class RolloutStack(Stack):
         self._rollout = Samples(*(torch.zeros(part, device=self._device) for part in shapes))
         self._episodes: list[deque[float]] = [deque(maxlen=EPISODES) for _ in members]
 
-    def learn(self, steps: int, wait: Callable[[], None]) -> None:
-        """Learn for the share of ``steps`` that is the learners'; ``wait`` returns when the environments have moved."""
+    def learn(self, steps: int) -> None:
+        """Learn for the share of ``steps`` that is the learners'."""
         first = self.members[0]
         total = first.spec.steps_of(steps) * (self._rows // first.agent_env.copies)
         if self._timesteps >= total:
@@ -134,7 +134,7 @@ class RolloutStack(Stack):
                 self._current, is_restoring = self._inputs.observe(update_moments=False), False
             starts = np.stack([member.agent_env.last_step.dones for member in self.members])
             self._starts = torch.as_tensor(starts, dtype=torch.float32, device=self._device)
-            self._collect(wait)
+            self._collect()
             self._update(1.0 - self._timesteps / total)
 
     def _deterministic_actions(self, observations: Tensor) -> Tensor:
@@ -145,7 +145,7 @@ class RolloutStack(Stack):
         for model in self._models:
             model.num_timesteps, model._n_updates = self._timesteps, self._updates
 
-    def _collect(self, wait: Callable[[], None]) -> None:
+    def _collect(self) -> None:
         """Fill the rollout by the policies of now."""
         rollout, log_std = self._rollout, self._weights.log_std[:, None]
         rewards, starts = torch.zeros_like(rollout.values), torch.zeros_like(rollout.values)
@@ -157,7 +157,7 @@ class RolloutStack(Stack):
             rollout.observations[:, :, t], rollout.actions[:, :, t] = self._current, actions
             rollout.log_probabilities[:, :, t] = ((rest - 0.5 * noise.square()) * self._acts).sum(dim=-1)
             starts[:, :, t] = self._starts
-            self._current = self._move(actions, wait)
+            self._current = self._move(actions)
             rewards[:, :, t], dones = self._inputs.rewards_and_dones()
             self._starts = torch.as_tensor(dones, dtype=torch.float32, device=self._device)
             if dones.any():

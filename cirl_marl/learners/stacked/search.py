@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from sb3_contrib import ARS
@@ -53,8 +53,8 @@ class SearchStack(Stack):
         self._before: int = first.num_timesteps // self._rows**2
         self._updates: int = first._n_updates
 
-    def learn(self, steps: int, wait: Callable[[], None]) -> None:
-        """Learn for the share of ``steps`` that is the learners'; ``wait`` returns when the environments have moved.
+    def learn(self, steps: int) -> None:
+        """Learn for the share of ``steps`` that is the learners'.
 
         With δ_k standard normal, R_k± the returns of the candidates θ ± s δ_k, and b the number of the best pairs::
 
@@ -70,7 +70,7 @@ class SearchStack(Stack):
             deltas = self._draw_directions()
             steps_in_weights = std * deltas
             centre = self._centre[:, None]
-            returns = self._returns(torch.cat([centre + steps_in_weights, centre - steps_in_weights], dim=1), wait)
+            returns = self._returns(torch.cat([centre + steps_in_weights, centre - steps_in_weights], dim=1))
             better, worse = returns[:, : first.n_delta], returns[:, first.n_delta :]
             top = torch.argsort(torch.maximum(better, worse), dim=1, descending=True)[:, : first.n_top]
             better, worse = better.gather(1, top), worse.gather(1, top)
@@ -108,16 +108,15 @@ class SearchStack(Stack):
             deltas[:, :, self._fixed_columns] = 0.0
         return deltas.to(self._device)
 
-    def _returns(self, candidates: Tensor, wait: Callable[[], None]) -> Tensor:
+    def _returns(self, candidates: Tensor) -> Tensor:
         """Return the returns of each learner in the episodes of each candidate, shape (learners, candidates)."""
         at_once = self._copies // self._copies_per_candidate
         parts = [
-            self._episodes(candidates[:, first : first + at_once], wait)
-            for first in range(0, candidates.shape[1], at_once)
+            self._episodes(candidates[:, first : first + at_once]) for first in range(0, candidates.shape[1], at_once)
         ]
         return torch.cat(parts, dim=1)
 
-    def _episodes(self, candidates: Tensor, wait: Callable[[], None]) -> Tensor:
+    def _episodes(self, candidates: Tensor) -> Tensor:
         """Let candidates, shape (learners, C, columns), act for one episode, each in its copies."""
         learners, count = candidates.shape[:2]
         matrix = candidates.reshape(learners * count, -1)
@@ -133,7 +132,7 @@ class SearchStack(Stack):
             )
             actions = self._actions(matrix, by_candidate)
             by_row = actions.view(learners, count, agents, self._copies_per_candidate, -1).transpose(1, 2)
-            observations = self._move(by_row.reshape(learners, self._rows, -1), wait)
+            observations = self._move(by_row.reshape(learners, self._rows, -1))
             rewards, dones = self._inputs.rewards_and_dones()
             total += (rewards + offset).view(*shape).sum(dim=(1, 3))
             goes_on = not dones.all()

@@ -7,7 +7,7 @@ ones. Spaces of unequal lengths are padded with zeros, which weights that are ze
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from torch import Tensor
 
+from cirl_marl.learners.agent_env import wait
 from cirl_marl.learners.checkpoint import observation_statistics
 from cirl_marl.learners.learner import Learner
 from cirl_marl.network import Integers
@@ -164,10 +165,10 @@ class Stack(ABC):
         self._steps_done, self._steps_given = 0, 0
 
     @abstractmethod
-    def learn(self, steps: int, wait: Callable[[], None]) -> None:
-        """Learn for the share of ``steps`` that is the learners'; ``wait`` returns when the environments have moved."""
+    def learn(self, steps: int) -> None:
+        """Learn for the share of ``steps`` that is the learners'."""
 
-    def act(self, wait: Callable[[], None]) -> None:
+    def act(self) -> None:
         """Act for ever without noise, learning nothing."""
         while True:
             self._arrive()
@@ -204,7 +205,7 @@ class Stack(ABC):
     def _give_models(self) -> None:
         """Bring models up to date."""
 
-    def _move(self, actions: Tensor, wait: Callable[[], None]) -> Tensor:
+    def _move(self, actions: Tensor) -> Tensor:
         """Act while learning; return the next observations."""
         self._inputs.hand_in(actions)
         wait()

@@ -42,9 +42,9 @@ class TeamVecEnv(AgentVecEnv):
         missed_steps: joint steps in which it was not asked.
     """
 
-    def __init__(self, copies: Copies, agent: str, wait: Callable[[], object]) -> None:
+    def __init__(self, copies: Copies, agent: str) -> None:
         """Show the copies as ``agent``."""
-        super().__init__(copies, agent, OneAgent(copies, agent), wait, AgentInCopy)
+        super().__init__(copies, agent, OneAgent(copies, agent), AgentInCopy)
         self._joint = copies
         self.missed_steps = 0
         self.present = self.acted_rows = np.ones(copies.num_envs, dtype=bool)

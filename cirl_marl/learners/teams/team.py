@@ -23,7 +23,7 @@ from cirl_marl.errors import CirlError, RecipeError, RunError, unknown_name
 from cirl_marl.learners.algorithms import RESERVED_PARAMETERS, every_algorithm
 from cirl_marl.learners.checkpoint import read_tree, write_tree
 from cirl_marl.learners.learner import TENSORBOARD_ADVICE, Learner, derived_seed, has_tensorboard, predict_action
-from cirl_marl.learners.lockstep import Lockstep, Participant, Streams, World, global_streams_claimed, wait
+from cirl_marl.learners.lockstep import Lockstep, Participant, Streams, World, global_streams_claimed
 from cirl_marl.learners.recipe import LearnerSettings, Normalisation
 from cirl_marl.learners.teams.copies import Copies, MakeEnv
 from cirl_marl.learners.teams.presence import TeamVecEnv, leave_out_absent
@@ -97,7 +97,7 @@ class Team:
         if tensorboard_log is not None and not has_tensorboard():
             raise CirlError(f"tensorboard_log={str(tensorboard_log)!r} needs TensorBoard: {TENSORBOARD_ADVICE}")
         self.agents = copies.agents
-        agent_envs = {agent: TeamVecEnv(copies, agent, wait) for agent in copies.agents}
+        agent_envs = {agent: TeamVecEnv(copies, agent) for agent in copies.agents}
         seeds = [derived_seed(seed, "copies", i) for i in range(copies.num_envs)]
         self.world = World(copies, seeds, agent_envs)
         self.learners: dict[str, Learner] = {}
@@ -184,7 +184,7 @@ class Team:
 
     def _play(self, copies: Copies, episodes: int, seed: int, deterministic: bool) -> dict[str, NDArray[np.floating]]:
         count = copies.num_envs
-        agent_envs = {agent: TeamVecEnv(copies, agent, wait) for agent in self.agents}
+        agent_envs = {agent: TeamVecEnv(copies, agent) for agent in self.agents}
         observations = copies.reset(seed=[derived_seed(seed, "evaluation", i) for i in range(count)])
         starts = {agent: np.ones(count, dtype=bool) for agent in self.agents}
         memory: dict[str, Any] = dict.fromkeys(self.agents)
