@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from benchmarks.generated import yearly_network
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, MultiAgentVectorEnv, Network, Node, Role, Series
+from cirl_marl.dynamics.elimination import SparseRow, StaticElimination, contract_hubs, square_matrix
 from cirl_marl.dynamics.integrator import Dynamics
-from cirl_marl.dynamics.static_elimination import SparseRow, StaticElimination, contract_hubs, square_matrix
 from cirl_marl.network import RowSum
 
 Floats = NDArray[np.float64]
@@ -53,7 +53,7 @@ def keeping(kept: Iterable[int]) -> Any:
     eliminate, kept = StaticElimination._eliminate, set(kept)
 
     def chosen(self: StaticElimination, constant: set[int]) -> None:
-        with patch("cirl_marl.dynamics.static_elimination.THRIFT", np.inf):
+        with patch("cirl_marl.dynamics.elimination.THRIFT", np.inf):
             eliminate(self, constant - kept)
 
     return patch.object(StaticElimination, "_eliminate", chosen)

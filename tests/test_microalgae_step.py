@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from paper_classes import PAPER
 from scipy.integrate import solve_ivp
 
-from cirl_marl.compartments import nutrient
+from cirl_marl.compartments import microalgae
+from cirl_marl.compartments.microalgae import draw_down
 from cirl_marl.compartments.microalgae_droop import MicroalgaeDroop
 from cirl_marl.compartments.microalgae_monod import MicroalgaeMonod
-from cirl_marl.compartments.nutrient import draw_down
 from cirl_marl.network.rowsum import Floats
 
 Model = MicroalgaeMonod | MicroalgaeDroop
@@ -149,8 +149,8 @@ class TestAccuracy:
         reference, uptake = exact(model, state, light, interval)
         rate, steps, errors = model.growth_per_day + model.dilution_per_day, [8, 16, 32], []
         for count in steps:
-            monkeypatch.setattr(nutrient, "SUBSTEP", interval * rate / (count - 0.5))
-            assert nutrient.substeps(interval, rate) == count
+            monkeypatch.setattr(microalgae, "SUBSTEP", interval * rate / (count - 0.5))
+            assert microalgae.substeps(interval, rate) == count
             after, outflow = model.integrate(state, np.array([[light]]), interval)
             errors.append([abs(after[0, 0] / reference[0, 0] - 1.0), abs(outflow[0] / uptake - 1.0)])
         slopes = np.polyfit(np.log(steps), np.log(errors), 1)[0]
@@ -249,7 +249,7 @@ class TestDrawDown:
                 flow = partial(draw_down, span=span, dilution=DILUTION, feed=FEED, half_saturation=half_saturation)
                 found = flow(outside, demand)
                 with monkeypatch.context() as patched:
-                    patched.setattr(nutrient, "NEWTON_STEPS", 2 * nutrient.NEWTON_STEPS)
+                    patched.setattr(microalgae, "NEWTON_STEPS", 2 * microalgae.NEWTON_STEPS)
                     settled = flow(outside, demand)
                 np.testing.assert_allclose(found.nutrient, settled.nutrient, rtol=1e-10)
                 np.testing.assert_allclose(found.saturation, settled.saturation, rtol=0.0, atol=1e-11 * span)

@@ -16,8 +16,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.dynamics.elimination import EliminatedShares
-from cirl_marl.dynamics.static_elimination import SparseRow, StaticElimination, square_matrix
+from cirl_marl.dynamics.elimination import EliminatedShares, SparseRow, StaticElimination, square_matrix
 from cirl_marl.dynamics.visit_bounds import VisitBounds
 from cirl_marl.network import Floats, Integers, Network, RowSum
 from cirl_marl.network.declarations import positional_record

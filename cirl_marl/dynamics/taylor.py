@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from cirl_marl.dynamics.kron_reduction import KronReduction
+from cirl_marl.dynamics.elimination import SparseRow, contract_hubs, square_matrix
 from cirl_marl.dynamics.laws import FlowLaws
-from cirl_marl.dynamics.routing import IntervalRoutes
-from cirl_marl.network import Floats, RowSum
+from cirl_marl.dynamics.routing import IntervalRoutes, Routing
+from cirl_marl.network import Floats, Integers, RowSum
 from cirl_marl.network.elements import Law
+from cirl_marl.network.rowsum import spans
 
 TRUNCATION = 1e-13
 """Bound on the first neglected term of the series, relative to the mass in the network."""
@@ -103,3 +106,104 @@ class Taylor:
                 mean[...] = stock
                 incidence.add_to(mean, flow)
         return flow
+
+
+class KronReduction:
+    """The mean of the state over a substep, in networks with nodes that store nothing, without the flows in between.
+
+    Only ẋ matters inside the series. It follows from x in four steps, each over all copies: the flows whose rates
+    differ from copy to copy; what of them and of the others comes to stocks and to kept nodes (``routing``), a sum with
+    constant weights; the throughputs of the kept nodes; and what of these comes to stocks, with constant weights but
+    for the shares that differ. The sums with constant weights go through as few nodes as they can: where the ways past
+    one are no more than the ways to it and from it, they lead past it.
+
+    The rows of one array are worked through from the first to the last: masses, flows that differ from copy to copy,
+    constant nodes on the way, throughputs of the kept nodes, shares of these that differ, constant nodes on the way
+    again, and what masses change by.
+    """
+
+    def __init__(self, laws: FlowLaws, factors: Sequence[float]) -> None:
+        """Compile the sums; ``factors`` are those of the derivatives in the series, from the innermost."""
+        self._factors = factors
+        routing, nodes, masses = laws.routing, laws.routing.nodes, laws.rows.masses
+        outer = laws.staged_network.donors < laws.rows.nodes.stop
+        place = {i: n for n, i in enumerate(routing.detours.kept_nodes)}
+        self._varying_flows = np.flatnonzero(outer & ~laws.is_fixed)
+        self._drivers = laws.driver[self._varying_flows]
+        donors = routing.donors.tolist()
+        varying_exits = [k for k, is_same in enumerate(routing.is_fixed) if donors[k] in place and not is_same]
+        self._varying_arcs = routing.arcs[varying_exits]
+        self._senders = np.array([place[donors[k]] for k in varying_exits], dtype=np.intp)
+
+        # nodes have the names that they have in ``detours``, and so has what stocks, the first of the masses, get
+        mass, flow, share, end = np.cumsum(
+            [nodes + masses, masses, len(self._varying_flows), len(varying_exits)]
+        ).tolist()
+        rates = laws.rate(laws.neutral[:, :1])[:, 0]
+        inflow_rows = _inflow_rows(laws, rates, range(mass, flow), range(flow, share), self._varying_flows)
+        before = contract_hubs(inflow_rows, routing.detours.order)
+        spread = _outflow_rows(routing, rates, range(share, end), varying_exits)
+        after = contract_hubs(spread, routing.detours.order)
+        names: list[Sequence[int]] = [range(mass, flow), range(flow, share), before, routing.detours.kept_nodes]
+        names += [range(share, end), after, range(nodes, nodes + masses)]
+        parts = spans(map(len, names))
+        self._masses, self._flows, hubs, self._kept_rows, self._varying_rows, _, self._change = parts
+        self._rest, size = slice(hubs.start, self._change.stop), self._change.stop
+        rows = [
+            dict(zip(columns, range(part.start, part.stop), strict=True))
+            for columns, part in zip(names, parts, strict=True)
+        ]
+        self._inflow_matrix = square_matrix(inflow_rows, rows[0] | rows[1] | rows[2] | rows[3] | rows[6], size)
+        self._spread = square_matrix(spread, rows[3] | rows[4] | rows[5] | rows[6], size)
+
+    def mean(self, stock: Floats, routes: IntervalRoutes, rate: Floats) -> Floats:
+        """Return the mean of the masses over the substep for constant ``rate``, shape (masses, B)."""
+        rates, shares = rate.take(self._varying_flows, 0), routes.rate.take(self._varying_arcs, 0)
+        work: Floats = np.empty((self._change.stop, stock.shape[1]))
+        mean: Floats = work[self._masses]
+        flows, kept_rows = work[self._flows], work[self._kept_rows]
+        varying_rows, change, rest = work[self._varying_rows], work[self._change], work[self._rest]
+        mean[...] = stock
+        for factor in self._factors:
+            np.multiply(mean.take(self._drivers, 0), rates, out=flows)
+            rest.fill(0.0)
+            self._inflow_matrix.substitute(work)
+            routes.kept_nodes.throughput(kept_rows)
+            np.multiply(kept_rows.take(self._senders, 0), shares, out=varying_rows)
+            self._spread.substitute(work)
+            change *= factor
+            np.add(stock, change, out=mean)
+        return mean
+
+
+def _inflow_rows(
+    laws: FlowLaws, rates: Floats, masses: Sequence[int], flows: Sequence[int], varying_flows: Integers
+) -> dict[int, SparseRow]:
+    """Return what masses and ``varying_flows`` send to stocks, and past constant nodes to stocks and kept nodes."""
+    detours, stores, nodes = laws.routing.detours, laws.rows.nodes.stop, laws.routing.nodes
+    number = dict(zip(varying_flows.tolist(), flows, strict=True))
+    gives: dict[int, SparseRow] = {name: {} for name in (*masses, *flows)}
+    for k in np.flatnonzero(laws.staged_network.donors < stores).tolist():
+        source, rate = (number[k], 1.0) if k in number else (masses[laws.driver[k]], float(rates[k]))
+        for end, part in ((laws.staged_network.donors[k], -rate), (laws.staged_network.recipients[k], rate)):
+            name = int(end) - stores if end >= stores else nodes + int(end)
+            gives[source][name] = gives[source].get(name, 0.0) + part
+    return gives | {i: dict(parts) for i, parts in zip(detours.order, detours.out, strict=True)}
+
+
+def _outflow_rows(
+    routing: Routing, rates: Floats, shares: Sequence[int], varying_exits: Sequence[int]
+) -> dict[int, SparseRow]:
+    """Return what kept nodes, and the arcs ``varying_exits`` of theirs, send to stocks.
+
+    What comes back to kept nodes is left out: it is in their throughputs already.
+    """
+    remaining_nodes, number = set(routing.detours.kept_nodes), dict(zip(varying_exits, shares, strict=True))
+    gives: dict[int, SparseRow] = {name: {} for name in (*remaining_nodes, *shares)}
+    for k, (i, end) in enumerate(zip(routing.donors.tolist(), routing.ends.tolist(), strict=True)):
+        if i in remaining_nodes and end not in remaining_nodes:
+            source, part = (number[k], 1.0) if k in number else (i, float(rates[routing.arcs[k]]))
+            gives[source][end] = gives[source].get(end, 0.0) + part
+    for i, parts in zip(routing.detours.order, routing.detours.out, strict=True):
+        gives[i] = {end: part for end, part in parts.items() if end not in remaining_nodes}
+    return gives
