@@ -60,22 +60,16 @@ def _toml_tables(document: dict[str, Any]) -> tomlkit.TOMLDocument:
         if key in ("nodes", "arcs", "services") and value:
             layout[key] = tomlkit.table(is_super_table=True)
             for id_, part in value.items():
-                layout[key][id_] = _table(part)
+                layout[key][id_] = _filled(tomlkit.table(), part)
         else:
-            layout[key] = _table(value) if isinstance(value, dict) and value else value
+            layout[key] = _filled(tomlkit.table(), value) if isinstance(value, dict) and value else value
     return layout
 
 
-def _table(part: dict[str, Any]) -> tomlkit.items.Table:
-    table = tomlkit.table()
-    for key, value in part.items():
-        table[key] = _inline(value) if isinstance(value, dict) else value
-    return table
-
-
-def _inline(value: dict[str, Any]) -> tomlkit.items.InlineTable:
-    table = tomlkit.inline_table()
-    table.update({key: _inline(entry) if isinstance(entry, dict) else entry for key, entry in value.items()})
+def _filled(table: Any, entries: dict[str, Any]) -> Any:
+    """Fill a TOML table; tables in it are inline."""
+    for key, entry in entries.items():
+        table[key] = _filled(tomlkit.inline_table(), entry) if isinstance(entry, dict) else entry
     return table
 
 
@@ -123,32 +117,21 @@ class _Writer:
                 spread = self._network.uncertain.get(f"{path}.{name}")
                 table[key] = self._quantity(value, declaration.kind(part)) | _spread_keys(spread, value)
             elif isinstance(declaration, Numbers):
-                table |= self._numbers(part, value, declaration, key)
+                unit = {"unit": self._units.get(declaration.of, "1"), "source": SOURCE}
+                if declaration.table_form == "range":
+                    table[key] = {"low": float(value[0]), "high": float(value[1]), **unit}
+                elif declaration.table_form == "batches":
+                    times, masses = ([float(pair[column]) for pair in value] for column in (0, 1))
+                    table[key] = {"times": times, "masses": masses, "time_unit": self._units["time"], **unit}
             elif isinstance(declaration, Subtable):
-                table[key] = self._subtable(part, value, declaration)
+                write = {"control": self._control, "model": self._model}.get(declaration.of)
+                table[key] = write(part) if write else self._part(value)
+            elif isinstance(value, tuple):
+                table[key] = list(value)
             else:
-                table[key] = (
-                    value if isinstance(value, bool) else list(value) if isinstance(value, tuple) else str(value)
-                )
+                table[key] = value if isinstance(value, bool) else str(value)
         table.pop("reward_scale", None)  # it stands in the table of the model
         return table
-
-    def _subtable(self, part: Any, value: Any, declaration: Subtable) -> dict[str, Any]:
-        if declaration.of == "lifetime":
-            return self._part(value)
-        return self._control(part) if declaration.of == "control" else self._model(part)
-
-    def _numbers(self, part: Any, value: Any, declaration: Numbers, key: str) -> dict[str, Any]:
-        """Return the table, or tables, that definition files spell several numbers in."""
-        time, unit = self._units["time"], self._units.get(declaration.of, "1")
-        if declaration.table_form == "range":
-            low, high = map(float, value)
-            return {key: {"low": low, "high": high, "unit": unit, "source": SOURCE}}
-        if declaration.table_form == "batches":
-            times, masses = ([float(pair[column]) for pair in value] for column in (0, 1))
-            units = {"time_unit": time, "unit": unit, "source": SOURCE}
-            return {key: {"times": times, "masses": masses, **units}}
-        return {}
 
     def _control(self, part: Compartment) -> dict[str, Any]:
         control = part.control
@@ -156,7 +139,7 @@ class _Writer:
         unit = self._units["flow"] if control.kind is ControlKind.FLOW else "1"
         if control.kind is ControlKind.INPUT and part.model is not None:
             unit = part.model.input_unit or "1"
-        sides = {side: getattr(control, side) for side in ("low", "neutral", "high")}
+        sides = {"low": control.low, "neutral": control.neutral, "high": control.high}
         bounds = {side: self._series(at) if isinstance(at, Series) else float(at) for side, at in sides.items()}
         return {"kind": control.kind.value, **bounds, "unit": unit, "source": SOURCE}
 
@@ -202,15 +185,11 @@ def _spread_keys(spread: Spread | None, value: Value) -> dict[str, Any]:
     middle = float(np.mean(value.values)) if isinstance(value, Series) else value
     entries: dict[str, Any] = {"distribution": spread.distribution}
     if spread.deviation is not None:
-        entries["deviation"] = _percent(spread.deviation)
+        # in percent, so that it reads back to the last bit
+        entries["deviation"] = f"{Decimal(repr(float(spread.deviation))) * 100:f} %"
     if math.isfinite(spread.high):
         entries["range"] = [spread.low * middle, spread.high * middle]
     return entries
-
-
-def _percent(part: float) -> str:
-    """Write a part of 1 in percent, so that it reads back to the last bit."""
-    return f"{Decimal(repr(float(part))) * 100:f} %"
 
 
 def _law_field(part: Any) -> str:

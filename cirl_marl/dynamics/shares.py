@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from cirl_marl.dynamics.uncertain_factors import RowFactors
@@ -58,17 +60,16 @@ class Shares:
         self._total = RowSum(
             self._of, np.arange(len(controlled_exits)), 1.0, (len(varying_splits), len(controlled_exits))
         )
-        bounds = np.concatenate([np.empty((3, 0, columns)), *(s.bounds[..., :columns] for s in varying_splits)], axis=1)
-        self._low, high = np.ascontiguousarray(bounds[0]), bounds[2]
+
+        def stacked(tables: Iterable[Floats]) -> Floats:
+            return np.concatenate([np.empty((0, columns)), *(table[:, :columns] for table in tables)])
+
+        self._low, neutral, high = (stacked(split.bounds[side] for split in varying_splits) for side in range(3))
         self._room = np.maximum(1.0 - self._total(self._low), 0.0)
-        self._proportions = np.concatenate(
-            [np.empty((0, columns)), *(s.proportions[:, :columns] for s in varying_splits)]
-        )
-        stated_values = np.concatenate(
-            [np.empty((0, columns)), *(s.stated_shares[:, :columns] for s in varying_splits)]
-        )
+        self._proportions = stacked(split.proportions for split in varying_splits)
+        stated_values = stacked(split.stated_shares for split in varying_splits)
         self._rest, self._stated_shares = np.isnan(stated_values), np.where(np.isnan(stated_values), 0.0, stated_values)
-        self._remainder = 1.0 - self._total(np.ascontiguousarray(bounds[1]))
+        self._remainder = 1.0 - self._total(neutral)
         self._total_of_others = RowSum(
             self._of_others, np.arange(len(free_exits)), 1.0, (len(varying_splits), len(free_exits))
         )

@@ -10,8 +10,8 @@ with D the lower ends of the services' bands: a linear complementarity problem. 
 delivers less, the map bends; it is then solved again from there. What others do in the interval is known. Nothing is
 said about a service whose supply cannot be enough: its level falls short.
 
-Where more than ``MOST_PROBES`` services are made up for, A is not measured but what arrives at once (``Arrivals``), with
-a factor for each service: how much of what was expected of the last correction has come about.
+Where more than ``MOST_PROBES`` services are made up for, A is not measured but what arrives at once (``Arrivals``),
+with a factor for each service: how much of what was expected of the last correction has come about.
 """
 
 from __future__ import annotations

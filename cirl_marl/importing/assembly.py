@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import astuple
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated
@@ -172,31 +173,21 @@ def _imbalance_message(table: FlowTable, residuals: Sequence[Residual]) -> str:
 
 def _write(folder: Path, file: str, name: str, definition: ImportedFiles, changes: Sequence[Change]) -> list[str]:
     """Write the files and return their names."""
-    files = [file, f"{name}.csv"]
+    header = ["region", "year", "source", "target", "type", "before", "after", "deviation", "in deviations"]
+    change_rows = [
+        [c.region, c.year, *astuple(c.pair), c.before, c.after, c.deviation, c.in_deviations]
+        for c in sorted(changes, key=lambda change: -abs(change.after - change.before))
+    ]
+    tables: dict[str, list[list[object]]] = {
+        f"{name}.csv": definition.data,
+        f"{name}_regions.csv": definition.regions,
+        f"{name}_changes.csv": [[*header], *change_rows] if changes else [],
+    }
     (folder / file).write_text(definition.text, encoding="utf-8")
-    write_table(folder / files[1], list(map(str, definition.data[0])), definition.data[1:])
-    if definition.regions:
-        files.append(f"{name}_regions.csv")
-        write_table(folder / files[-1], list(map(str, definition.regions[0])), definition.regions[1:])
-    if changes:
-        files.append(f"{name}_changes.csv")
-        header = ["region", "year", "source", "target", "type", "before", "after", "deviation", "in deviations"]
-        rows = [
-            (
-                c.region,
-                c.year,
-                c.pair.source,
-                c.pair.target,
-                c.pair.type,
-                c.before,
-                c.after,
-                c.deviation,
-                c.in_deviations,
-            )
-            for c in sorted(changes, key=lambda change: -abs(change.after - change.before))
-        ]
-        write_table(folder / files[-1], header, rows)
-    return files
+    written = {table: rows for table, rows in tables.items() if rows}
+    for table, rows in written.items():
+        write_table(folder / table, list(map(str, rows[0])), rows[1:])
+    return [file, *written]
 
 
 def _largest_error(path: Path, table: FlowTable, definition: ImportedFiles, progress: Callable[[float], None]) -> float:

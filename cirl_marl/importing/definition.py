@@ -6,6 +6,7 @@ import json
 import re
 import unicodedata
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -97,19 +98,18 @@ def shares_of(flows: Floats) -> Floats:
     return np.asarray(shares)
 
 
+@dataclass
 class _Writer:
-    def __init__(
-        self,
-        table: FlowTable,
-        processes: Processes,
-        roles: Mapping[str, Role],
-        stocks: Mapping[tuple[str, str, int], float],
-        name: str,
-        title: str,
-        source: str,
-    ) -> None:
-        self._table, self._processes, self._roles, self._stocks = table, processes, roles, stocks
-        self._name, self._title, self._source = name, title, source
+    _table: FlowTable
+    _processes: Processes
+    _roles: Mapping[str, Role]
+    _stocks: Mapping[tuple[str, str, int], float]
+    _name: str
+    _title: str
+    _source: str
+
+    def __post_init__(self) -> None:
+        table, processes = self._table, self._processes
         self._mass = table.unit.rpartition("/")[0]
         self._regional = table.regions != ("",)
         self._nodes = identifiers(processes.names)
@@ -211,12 +211,8 @@ class _Writer:
     def _first_stocks(self, process: str) -> dict[str, float]:
         """Return the stock at the end of the year before the first by region; nothing if one is not known."""
         before = self._table.years[0] - 1
-        stocks = {region: self._stocks.get((region, process, before)) for region in self._table.regions}
-        return (
-            {region: stock for region, stock in stocks.items() if stock is not None}
-            if all(stock is not None for stock in stocks.values())
-            else {}
-        )
+        keys = {region: (region, process, before) for region in self._table.regions}
+        return {r: self._stocks[k] for r, k in keys.items()} if self._stocks.keys() >= {*keys.values()} else {}
 
     def _arc_tables(self) -> Iterator[str]:
         for pair, id_ in self._arcs.items():

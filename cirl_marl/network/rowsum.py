@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from copy import copy
 from itertools import pairwise
 
 import numpy as np
@@ -78,8 +79,7 @@ class RowSum:
 
     def scaled_by(self, factor: float) -> RowSum:
         """Return factor·W."""
-        matrix = object.__new__(RowSum)
-        matrix.shape, matrix._starts, matrix._rows = self.shape, self._starts, self._rows
+        matrix = copy(self)
         matrix._weights = self._weights * factor
         return matrix
 
