@@ -24,7 +24,9 @@ from rich.console import Console
 from benchmarks.document import markdown_table, write_sections
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.evaluation import Entry, compare
-from cirl_marl.learners import Recipe, RunDirectory, load_recipe, train_seeds
+from cirl_marl.learners.interface import train_seeds
+from cirl_marl.learners.recipe import Recipe, load_recipe
+from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.records.files import write_json
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "study.md"

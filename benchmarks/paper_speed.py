@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.document import markdown_table
-from cirl_marl.learners import load_recipe
+from cirl_marl.learners.recipe import load_recipe
 from cirl_marl.learners.trainer import one_torch_thread
 from cirl_marl.paper.published import HARDWARE, environment_of
 from cirl_marl.paper.results import WINDOW, PaperRow

@@ -38,7 +38,8 @@ from benchmarks.generated import (
 from cirl_marl import parallel_env
 from cirl_marl.environments.parallel import NetworkParallelEnv
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.learners import Recipe, load_recipe, train, train_seeds
+from cirl_marl.learners.interface import train, train_seeds
+from cirl_marl.learners.recipe import Recipe, load_recipe
 from cirl_marl.network import Network
 from cirl_marl.records.machine import processor
 

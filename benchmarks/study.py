@@ -30,8 +30,8 @@ from cirl_marl.evaluation import Comparison, Row, compare, solve_baseline
 from cirl_marl.evaluation.comparison import starting_stocks
 from cirl_marl.evaluation.statistics import Aggregate, over_episodes, over_seeds
 from cirl_marl.jobs import JobStatus, Tell, raise_first, run_jobs
-from cirl_marl.learners import RunDirectory, train_seeds
-from cirl_marl.learners.interface import prepare
+from cirl_marl.learners.interface import prepare, train_seeds
+from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats
 from cirl_marl.optimum import gap
 from cirl_marl.optimum.mpc import MPC, SERVICE_FIRST

@@ -24,8 +24,8 @@ from cirl_marl.network.elements import FIXED_LIFETIME, Lifetime
 from cirl_marl.network.lifetimes import SURVIVALS
 
 if TYPE_CHECKING:
-    from cirl_marl.learners import Progress
     from cirl_marl.learners.recipe import Recipe
+    from cirl_marl.learners.trainer import Progress
 
 settings.register_profile(
     "cirl_marl",
@@ -127,7 +127,7 @@ def ppo_recipe() -> Recipe:
 @pytest.fixture(scope="session")
 def copper_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a run of ``ppo_recipe`` in ``copper_net``, in episodes of five steps, that tests only read."""
-    from cirl_marl.learners import train
+    from cirl_marl.learners.interface import train
 
     directory = tmp_path_factory.mktemp("copper") / "run"
     train("copper_net", few_rollouts(), directory=directory, horizon=5)

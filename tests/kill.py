@@ -16,7 +16,8 @@ from pathlib import Path
 
 from test_exact_resumption import CASES, files, recipe
 
-from cirl_marl.learners import RunDirectory, resume, train
+from cirl_marl.learners.interface import resume, train
+from cirl_marl.learners.run_directory import RunDirectory
 
 EACH = 5
 """Kills of one training."""

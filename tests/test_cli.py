@@ -28,7 +28,8 @@ from cirl_marl.controllers.rollout import episode_start, first_seed
 from cirl_marl.definitions.catalogue import folder
 from cirl_marl.definitions.reader import write_network
 from cirl_marl.evaluation.assessment import evaluate
-from cirl_marl.learners import RunDirectory, train
+from cirl_marl.learners.interface import train
+from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.optimum import search_each
 from cirl_marl.report import run as pictures
 from cirl_marl.report import trajectory

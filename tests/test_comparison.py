@@ -24,7 +24,10 @@ from cirl_marl.evaluation.contenders import differences
 from cirl_marl.evaluation.figures import provenance
 from cirl_marl.evaluation.pareto import pareto_front
 from cirl_marl.evaluation.statistics import interquartile_mean
-from cirl_marl.learners import Progress, Recipe, RunDirectory, Training, load_recipe, resume, train
+from cirl_marl.learners.interface import resume, train
+from cirl_marl.learners.recipe import Recipe, load_recipe
+from cirl_marl.learners.run_directory import RunDirectory
+from cirl_marl.learners.trainer import Progress, Training
 from cirl_marl.network import Network
 from cirl_marl.optimum import search_each
 from cirl_marl.records.files import publish_folder

@@ -15,7 +15,7 @@ from cirl_marl.controllers.rollout import rollout
 from cirl_marl.definitions.reader import Definition, write_network
 from cirl_marl.drawing.digraph import save_network
 from cirl_marl.drawing.folding import fold_copies
-from cirl_marl.learners import Recipe
+from cirl_marl.learners.recipe import Recipe
 
 ONE = f'unit = "1", {SOURCE}'
 REGIONS = '[regions]\njapan = "Japan"\nchina = "China"\n'

@@ -16,7 +16,8 @@ from cirl_marl import DefinitionError, RunError, Series, load_network
 from cirl_marl.definitions import data_files
 from cirl_marl.definitions.reader import Definition
 from cirl_marl.evaluation.figures import provenance
-from cirl_marl.learners import Recipe, train
+from cirl_marl.learners.interface import train
+from cirl_marl.learners.recipe import Recipe
 from cirl_marl.learners.run_directory import RunDirectory
 
 JAPAN = 'where = { country = "Japan" }'

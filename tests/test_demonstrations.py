@@ -20,10 +20,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from cirl_marl import ControlError, DefinitionError, MultiAgentVectorEnv, RecipeError
 from cirl_marl.controllers import Controller, ScriptController
 from cirl_marl.environments.goal import GoalEnv
-from cirl_marl.learners import Recipe, Training, load_recipe, resume, train
 from cirl_marl.learners.demonstrations import demonstrate, in_copies
+from cirl_marl.learners.interface import resume, train
 from cirl_marl.learners.learner import derived_seed
-from cirl_marl.learners.recipe import Demonstrations
+from cirl_marl.learners.recipe import Demonstrations, Recipe, load_recipe
+from cirl_marl.learners.trainer import Training
 from cirl_marl.learners.views import View
 from cirl_marl.optimum.registry import CONTROLLERS, named_controller
 from cirl_marl.paper.published import ENVIRONMENTS

@@ -20,7 +20,8 @@ import cirl_marl
 from cirl_marl import cli
 from cirl_marl.definitions.catalogue import families
 from cirl_marl.definitions.reader import Definition
-from cirl_marl.learners import load_recipe, train
+from cirl_marl.learners.interface import train
+from cirl_marl.learners.recipe import load_recipe
 from docs.site.reference import reference_tables
 
 ROOT = Path(__file__).parent.parent

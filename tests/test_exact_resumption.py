@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cirl_marl.learners import Recipe, RunDirectory, resume, train
 from cirl_marl.learners import trainer as module
+from cirl_marl.learners.interface import resume, train
 from cirl_marl.learners.lockstep import TrainingStop
-from cirl_marl.learners.recipe import LearnerSettings, Run
+from cirl_marl.learners.recipe import LearnerSettings, Recipe, Run
+from cirl_marl.learners.run_directory import RunDirectory
 
 pytestmark = pytest.mark.medium
 

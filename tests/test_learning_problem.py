@@ -10,7 +10,9 @@ import pytest
 from cirl_marl import MultiAgentVectorEnv
 from cirl_marl.controllers import Constant, Controller, Neutral
 from cirl_marl.controllers.rollout import Rollout, rollout
-from cirl_marl.learners import RunDirectory, load_recipe, train
+from cirl_marl.learners.interface import train
+from cirl_marl.learners.recipe import load_recipe
+from cirl_marl.learners.run_directory import RunDirectory
 
 BETTER = {
     "copper_net": {"mine": -0.5, "use_to_landfill": -1.0, "use_to_collection": 0.5, "use": -0.5},

@@ -16,7 +16,9 @@ import pytest
 from cirl_marl import parallel_env
 from cirl_marl.cli import app
 from cirl_marl.controllers.rollout import rollout
-from cirl_marl.learners import RunDirectory, Team, Trained, resume
+from cirl_marl.learners.interface import Trained, resume
+from cirl_marl.learners.run_directory import RunDirectory
+from cirl_marl.learners.teams.team import Team
 from cirl_marl.records.machine import processor, versions
 
 OLDER = Path(__file__).parent / "fixtures" / "0.1.0"

@@ -28,7 +28,8 @@ from cirl_marl.compartments import kind_of, model_class
 from cirl_marl.compartments.digester import Digester
 from cirl_marl.definitions.reader import write_network
 from cirl_marl.evaluation import compare
-from cirl_marl.learners import Recipe, train
+from cirl_marl.learners.interface import train
+from cirl_marl.learners.recipe import Recipe
 
 
 def brewery() -> Network:

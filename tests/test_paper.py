@@ -23,8 +23,10 @@ from benchmarks.paper_difference import difference
 from benchmarks.paper_document import markdown
 from cirl_marl import CirlError, RecipeError, cli
 from cirl_marl.errors import RunError
-from cirl_marl.learners import Recipe, Training, load_recipe, train
 from cirl_marl.learners.algorithms import build
+from cirl_marl.learners.interface import train
+from cirl_marl.learners.recipe import Recipe, load_recipe
+from cirl_marl.learners.trainer import Training
 from cirl_marl.paper import published, rows, training
 from cirl_marl.paper.published import ALGORITHMS, ENVIRONMENTS, PaperEnvironment, PublishedRun
 from cirl_marl.paper.results import EvaluationFigures, PaperRow, Result, Results, thin_out

@@ -12,7 +12,7 @@ import pytest
 from cirl_marl.definitions.catalogue import folder, load_network
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.evaluation.pareto import ParetoFront, pareto_front
-from cirl_marl.learners import load_recipe
+from cirl_marl.learners.recipe import load_recipe
 from cirl_marl.network import Network
 from cirl_marl.optimum import NoCertificate
 from cirl_marl.report.tradeoffs import PARETO_FILES, write_front

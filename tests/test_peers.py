@@ -26,8 +26,8 @@ from cirl_marl.controllers.rollout import rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.baselines import Baseline
-from cirl_marl.learners import load_recipe
 from cirl_marl.learners.interface import prepare
+from cirl_marl.learners.recipe import load_recipe
 
 CODE = Path(run.__file__).parent
 

@@ -21,8 +21,7 @@ from cirl_marl import CirlError, MultiAgentVectorEnv, Network, RunError, load_ne
 from cirl_marl.controllers.basic import Arrays
 from cirl_marl.controllers.rollout import first_seed
 from cirl_marl.evaluation.assessment import evaluate
-from cirl_marl.learners import train
-from cirl_marl.learners.interface import Trained
+from cirl_marl.learners.interface import Trained, train
 from cirl_marl.learners.policies import DifferentiablePolicy, Policies, Policy
 from cirl_marl.learners.recipe import LearnerSettings, Normalisation, Recipe, Run
 from cirl_marl.learners.views import OneAgent

@@ -15,9 +15,9 @@ from small_networks import ONE_OF_EACH
 import cirl_marl
 from cirl_marl import CirlError, DefinitionError, MultiAgentVectorEnv, RecipeError
 from cirl_marl.definitions.catalogue import folder
-from cirl_marl.learners import Recipe, load_recipe, train
 from cirl_marl.learners.algorithms import algorithms, parameter_mistakes, parameters_of
-from cirl_marl.learners.recipe import LearnerSettings, Match, Normalisation, Options, recipe_schema
+from cirl_marl.learners.interface import train
+from cirl_marl.learners.recipe import LearnerSettings, Match, Normalisation, Options, Recipe, load_recipe, recipe_schema
 
 GOOD = """
 name = "mine"

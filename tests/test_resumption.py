@@ -11,8 +11,10 @@ import pytest
 from stable_baselines3.common.callbacks import BaseCallback
 
 from cirl_marl import CirlError, LearnerError, RecipeError, RunError
-from cirl_marl.learners import Progress, Recipe, RunDirectory, resume, train
-from cirl_marl.learners.recipe import Demonstrations, LearnerSettings, Run
+from cirl_marl.learners.interface import resume, train
+from cirl_marl.learners.recipe import Demonstrations, LearnerSettings, Recipe, Run
+from cirl_marl.learners.run_directory import RunDirectory
+from cirl_marl.learners.trainer import Progress
 
 pytestmark = pytest.mark.medium
 

@@ -16,10 +16,10 @@ from stable_baselines3.common.vec_env import VecNormalize
 import cirl_marl
 from cirl_marl import MultiAgentVectorEnv, RunError
 from cirl_marl.controllers.rollout import rollout
-from cirl_marl.learners import Recipe, RunDirectory, resume, train
 from cirl_marl.learners import run_directory as learners_run
-from cirl_marl.learners.interface import Trained
-from cirl_marl.learners.recipe import LearnerSettings, Normalisation, Run
+from cirl_marl.learners.interface import Trained, resume, train
+from cirl_marl.learners.recipe import LearnerSettings, Normalisation, Recipe, Run
+from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.records import files as files_module
 from cirl_marl.records.files import write_atomically
 

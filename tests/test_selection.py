@@ -16,9 +16,9 @@ from cirl_marl import MultiAgentVectorEnv, RecipeError, RunError
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.assessment import acting_checkpoint
-from cirl_marl.learners import RunDirectory, resume, train
-from cirl_marl.learners.interface import Trained
+from cirl_marl.learners.interface import Trained, resume, train
 from cirl_marl.learners.recipe import LearnerSettings, Recipe, Run
+from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.learners.validation import FIRST_SEED, LARGEST_MULTIPLIER, Score, ServiceMultiplier, validation_score
 
 HORIZON, STEPS = 6, 96

@@ -22,7 +22,7 @@ from cirl_marl import CirlError, cli, load_network
 from cirl_marl.compartments import models
 from cirl_marl.definitions.catalogue import families
 from cirl_marl.definitions.sources import stated_numbers, stated_settings
-from cirl_marl.learners import load_recipe
+from cirl_marl.learners.recipe import load_recipe
 from cirl_marl.network.declarations import declarations
 from docs.site import networks as network_pages
 from docs.site import notebooks

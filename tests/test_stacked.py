@@ -20,12 +20,13 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from cirl_marl import CirlError, MultiAgentVectorEnv, RecipeError
-from cirl_marl.learners import RunDirectory, Training, export, resume, train
-from cirl_marl.learners.interface import Trained, train_seeds
+from cirl_marl.learners.interface import Trained, export, resume, train, train_seeds
 from cirl_marl.learners.learner import derived_seed
 from cirl_marl.learners.lockstep import Streams
 from cirl_marl.learners.recipe import LearnerSettings, Match, Normalisation, Recipe, Run
+from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.learners.stacked.perceptrons import ACTIVATIONS, Layer, Perceptrons
+from cirl_marl.learners.trainer import Training
 
 PPO_SMALL = {"n_steps": 10, "batch_size": 10, "n_epochs": 2, "policy_kwargs": {"net_arch": [8, 8]}}
 AGENTS = ["mine", "use", "sorting"]

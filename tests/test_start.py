@@ -16,9 +16,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl import CirlError, DefinitionError, LearnerError, RecipeError
-from cirl_marl.learners import Recipe, RunDirectory, Training, load_recipe, resume, train
-from cirl_marl.learners.interface import Trained, prepare
+from cirl_marl.learners.interface import Trained, prepare, resume, train
 from cirl_marl.learners.learner import Learner, load_acting_learner
+from cirl_marl.learners.recipe import Recipe, load_recipe
+from cirl_marl.learners.run_directory import RunDirectory
+from cirl_marl.learners.trainer import Training
 
 AGENTS = ["mine", "use"]
 OPTIONS: dict[str, Any] = {"agents": AGENTS, "horizon": 4}

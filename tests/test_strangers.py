@@ -24,8 +24,9 @@ from cirl_marl.cli import main
 from cirl_marl.definitions.catalogue import folder
 from cirl_marl.definitions.reader import write_network
 from cirl_marl.evaluation import assessment
-from cirl_marl.learners import Recipe, RunDirectory, resume, train
-from cirl_marl.learners.interface import Trained
+from cirl_marl.learners.interface import Trained, resume, train
+from cirl_marl.learners.recipe import Recipe
+from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network.units import factor
 
 pytestmark = pytest.mark.medium
@@ -210,7 +211,8 @@ def test_definitions_import_nothing_unless_they_may(tmp_path: Path, monkeypatch:
 
 KILLED = """
 import os, signal, sys
-from cirl_marl.learners import Recipe, train, resume
+from cirl_marl.learners.interface import train, resume
+from cirl_marl.learners.recipe import Recipe
 from cirl_marl.learners import trainer as training
 import cirl_marl.records.files as files, cirl_marl.learners.run_directory as run_module
 from pathlib import Path

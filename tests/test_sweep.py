@@ -26,7 +26,7 @@ from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.pareto import pareto_front
 from cirl_marl.evaluation.statistics import over_episodes
 from cirl_marl.jobs import JobStatus
-from cirl_marl.learners import train
+from cirl_marl.learners.interface import train
 from cirl_marl.network import Network
 from cirl_marl.sweeps import Cell, CellStatus, load_sweep, sweep
 from cirl_marl.sweeps.cells import cells_of

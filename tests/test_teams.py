@@ -24,9 +24,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import cirl_marl
 from cirl_marl import CirlError, LearnerError, RecipeError, RunError
-from cirl_marl.learners import load_recipe, train
+from cirl_marl.learners.interface import train
 from cirl_marl.learners.learner import derived_seed
-from cirl_marl.learners.recipe import Normalisation
+from cirl_marl.learners.recipe import Normalisation, load_recipe
 from cirl_marl.learners.teams.team import Team
 from cirl_marl.learners.trainer import one_torch_thread
 

@@ -18,11 +18,12 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 import cirl_marl
 from cirl_marl import Arc, Control, ControlKind, LearnerError, MultiAgentVectorEnv, Network, Node, RunError
-from cirl_marl.learners import Recipe, RunDirectory, Training, resume, train
 from cirl_marl.learners.agent_env import AgentVecEnv
-from cirl_marl.learners.interface import Trained
+from cirl_marl.learners.interface import Trained, resume, train
 from cirl_marl.learners.learner import derived_seed
-from cirl_marl.learners.recipe import LearnerSettings, Match, Run
+from cirl_marl.learners.recipe import LearnerSettings, Match, Recipe, Run
+from cirl_marl.learners.run_directory import RunDirectory
+from cirl_marl.learners.trainer import Training
 from cirl_marl.learners.views import OneAgent
 from cirl_marl.network.elements import Episode, Law
 from cirl_marl.paper.results import PaperRow

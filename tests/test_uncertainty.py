@@ -43,7 +43,7 @@ from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.environments.state import Outcome
 from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.sampling import rbd_fast, sample_episodes, sensitivities
-from cirl_marl.learners import train
+from cirl_marl.learners.interface import train
 from cirl_marl.network.uncertainty import DISTRIBUTIONS, Spread, draw_network
 from cirl_marl.optimum import bound
 

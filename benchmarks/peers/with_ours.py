@@ -9,8 +9,10 @@ from benchmarks.peers.problem import Scaling
 from benchmarks.peers.settings import NETWORK, SETTINGS
 from benchmarks.peers.watch import TimeIsUp, Watch
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.learners import Recipe, load_recipe, train, trainer
+from cirl_marl.learners import trainer
+from cirl_marl.learners.interface import train
 from cirl_marl.learners.policies import Policies
+from cirl_marl.learners.recipe import Recipe, load_recipe
 from cirl_marl.learners.trainer import Progress
 from cirl_marl.learners.validation import Score, validation_score
 

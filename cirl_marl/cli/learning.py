@@ -82,7 +82,7 @@ def train(
 
     Ctrl-C, SIGTERM and SIGHUP save the run and end with code 130: it is interrupted, and --resume goes on with it.
     """
-    from cirl_marl import learners
+    from cirl_marl.learners import interface
 
     if network is None and resume is None:
         raise CirlError("train needs NETWORK, or --resume RUN")
@@ -93,18 +93,19 @@ def train(
     options: dict[str, Any] = {"steps": steps, "envs": envs, "scenario": scenario, "reward": reward, "engine": engine}
     options |= {"min_service": min_service, "uncertain": uncertain, "checkpoint_every": checkpoint_every}
     options |= {"observe": observe, "agents": None if agents is None else comma_separated(agents), "device": device}
-    directories = [resume] if resume is not None else _directories(out, str(network), recipe, range(seed, seed + seeds))
+    all_seeds = range(seed, seed + seeds)
+    directories = [resume] if resume is not None else _directories(out, str(network), recipe, all_seeds)
     with training_bar() as report:
         options["report"] = report
         try:
             if resume is not None:
                 resume_options: dict[str, Any] = {"device": device, "checkpoint_every": checkpoint_every}
-                learners.resume(resume, steps=steps, report=report, **resume_options)
+                interface.resume(resume, steps=steps, report=report, **resume_options)
             elif seeds > 1:
                 parent = str(directories[0]).removesuffix(f"-seed{seed}")
-                learners.train_seeds(str(network), recipe, seeds=range(seed, seed + seeds), directory=parent, **options)
+                interface.train_seeds(str(network), recipe, seeds=all_seeds, directory=parent, **options)
             else:
-                learners.train(str(network), recipe, seed=seed, directory=directories[0], **options)
+                interface.train(str(network), recipe, seed=seed, directory=directories[0], **options)
         except KeyboardInterrupt:
             for directory in directories:
                 console.print(f"\nstopped; {what_is_kept(directory)}", soft_wrap=True, highlight=False)
@@ -147,9 +148,9 @@ def export(
     run: RunPath, out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")]
 ) -> None:
     """Write the trained policies as files that Stable-Baselines3 loads; this library itself never reads such files."""
-    from cirl_marl import learners
+    from cirl_marl.learners import interface
 
-    for path in learners.export(run, out):
+    for path in interface.export(run, out):
         say(f"{path}")
 
 

@@ -25,7 +25,7 @@ from cirl_marl.cli.common import (
 from cirl_marl.errors import CirlError
 
 if TYPE_CHECKING:
-    from cirl_marl.learners import Recipe
+    from cirl_marl.learners.recipe import Recipe
     from cirl_marl.network import Network
 
 

@@ -18,7 +18,8 @@ from cirl_marl.evaluation.baselines import FRONT
 from cirl_marl.evaluation.comparison import ProgressReport, part_of
 from cirl_marl.evaluation.contenders import differences
 from cirl_marl.jobs import JobStatus, Tell, check_place, raise_first, run_jobs
-from cirl_marl.learners import Recipe, RunDirectory, load_recipe
+from cirl_marl.learners.recipe import Recipe, load_recipe
+from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum import Bound, Envelope, NoCertificate, bound, improve_plan, simulate_plan

@@ -19,11 +19,12 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.definitions.writer import fingerprint
 from cirl_marl.errors import CirlError, RecipeError, RunError
-from cirl_marl.learners import Progress, Recipe, load_recipe, train
 from cirl_marl.learners.algorithms import build
 from cirl_marl.learners.demonstrations import demonstrate, in_copies
+from cirl_marl.learners.interface import train
 from cirl_marl.learners.learner import derived_seed, wrap_in_normaliser
-from cirl_marl.learners.recipe import LearnerSettings, Normalisation
+from cirl_marl.learners.recipe import LearnerSettings, Normalisation, Recipe, load_recipe
+from cirl_marl.learners.trainer import Progress
 from cirl_marl.network.declarations import frozen_record
 from cirl_marl.paper.published import PaperEnvironment
 from cirl_marl.paper.results import PaperRow

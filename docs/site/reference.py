@@ -12,7 +12,7 @@ from cirl_marl import cli, load_network, recipes
 from cirl_marl.definitions.catalogue import families
 from cirl_marl.definitions.ids import ids
 from cirl_marl.environments.registration import PAPER_ENVIRONMENTS
-from cirl_marl.learners import load_recipe
+from cirl_marl.learners.recipe import load_recipe
 from docs.site.markdown import ROOT, table
 
 DOCUMENT = ROOT / "docs" / "reference.md"
