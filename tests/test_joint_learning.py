@@ -20,9 +20,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 import cirl_marl
 from cirl_marl import DefinitionError, MultiAgentVectorEnv, Network, vector_env
 from cirl_marl.controllers.rollout import rollout
-from cirl_marl.learners.central_critic import CentralCriticPolicy
 from cirl_marl.learners.interface import Trained, train
 from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, Streams
+from cirl_marl.learners.policies import CentralCriticPolicy
 from cirl_marl.learners.recipe import LearnerSettings, Match, Normalisation, Recipe, Run, load_recipe
 from cirl_marl.learners.trainer import Training
 from cirl_marl.learners.views import AllAtOnce, OneAgent, SharedPolicy, View, unseen_state, view_of

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 from greenlet import getcurrent
@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvObs, Vec
 from cirl_marl.controllers.basic import Arrays
 from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
-from cirl_marl.learners.views import ObservedRows, View, by_part, rows_of
+from cirl_marl.learners.views import BatchedEnv, ObservedRows, View, by_part, rows_of
 from cirl_marl.network import Floats
 from cirl_marl.network.elements import Compartment
 
@@ -22,26 +22,6 @@ from cirl_marl.network.elements import Compartment
 def wait() -> None:
     """Leave a learner's coroutine until every learner has acted and the joint step is done."""
     getcurrent().parent.switch()
-
-
-class BatchedEnv(Protocol):
-    """Several copies of an environment of many agents, all stepped at once; ``MultiAgentVectorEnv`` is one.
-
-    What it takes and gives is by agent, with a leading axis of ``num_envs`` entries. An episode that has ended is
-    followed by the next at once; what was seen last is ``final_obs`` in the infos.
-    """
-
-    num_envs: int
-    agents: tuple[str, ...]
-
-    def reset(self, *, seed: Any = None) -> Any:
-        """Begin episodes in all copies and return the first observations."""
-
-    def step(self, actions: Any) -> Any:
-        """Move all copies; return observations, rewards, terminations, truncations and infos."""
-
-    def state(self) -> Floats:
-        """Return the whole state, for critics that see it."""
 
 
 @dataclass(frozen=True, slots=True)

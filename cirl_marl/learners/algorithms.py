@@ -24,7 +24,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from cirl_marl.errors import RecipeError, unknown_name
-from cirl_marl.learners.central_critic import CentralCriticPolicy
+from cirl_marl.learners.policies import CentralCriticPolicy
 from cirl_marl.learners.views import CENTRAL_CRITIC
 
 DISCRETE = ("DQN", "QRDQN", "MaskablePPO")

@@ -79,10 +79,9 @@ def train(
         KeyboardInterrupt: after Ctrl-C, SIGTERM or SIGHUP; the run is saved first and can be resumed.
     """
     _check_options(options, train)
-    directories = None if directory is None else [Path(directory)]
     options |= {"steps": steps, "envs": envs, "engine": engine, "min_service": min_service, "agents": agents}
     options |= {"callbacks": callbacks, "report": report, "device": device, "checkpoint_every": checkpoint_every}
-    (training,) = _train(network, recipe, [seed], directories, **options)
+    (training,) = _train(network, recipe, [(seed, directory)], **options)
     return training
 
 
@@ -102,15 +101,14 @@ def train_seeds(
     are those of ``train``.
     """
     _check_options(options, train, train_seeds)
-    directories = None if directory is None else [Path(f"{directory}-seed{seed}") for seed in seeds]
-    return _train(network, recipe, seeds, directories, report=report, device=device, **options)
+    runs = [(seed, None if directory is None else f"{directory}-seed{seed}") for seed in seeds]
+    return _train(network, recipe, runs, report=report, device=device, **options)
 
 
 def _train(
     network: str | Path | Network,
     recipe: str | Path | Recipe,
-    seeds: Sequence[int],
-    directories: Sequence[Path] | None,
+    runs: Sequence[tuple[int, str | Path | None]],
     *,
     callbacks: Mapping[str, BaseCallback] | None = None,
     report: Callable[[Progress], None] | None = None,
@@ -119,14 +117,15 @@ def _train(
 ) -> list[Training]:
     with ExitStack() as claims:
         claims.enter_context(global_streams_claimed())
-        trainings = [prepare(network, recipe, seed=seed, **options) for seed in seeds]
+        trainings = [prepare(network, recipe, seed=seed, **options) for seed, _ in runs]
         for training in trainings:
             training.check_callbacks(callbacks or {})
             training.stackable(callbacks or {})
-        for directory, training in zip(directories or (), trainings, strict=directories is not None):
-            run = _create(directory, training.config, training.env.network)
-            claims.enter_context(run.lock())
-            training.keep_in(run)
+        for (_, directory), training in zip(runs, trainings, strict=True):
+            if directory is not None:
+                run = _create(Path(directory), training.config, training.env.network)
+                claims.enter_context(run.lock())
+                training.keep_in(run)
         run_together(trainings, callbacks=callbacks, report=report, device=device)
     return trainings
 

@@ -133,11 +133,7 @@ class Learner:
         return self
 
     def load(self, folder: Path) -> Learner:
-        """Make the algorithm, and load the state that it had at the end of a training.
-
-        Raises:
-            RunError: if a file is missing, cannot be read, or is of another learner.
-        """
+        """Make the algorithm, and load the state that it had at the end of a training; errors as ``take`` has them."""
         self.build()
         state = read_tree(folder, f"{self.name}.state")
         with self._errors_name_file(folder):
@@ -149,10 +145,8 @@ class Learner:
     def restore(self, folder: Path) -> Learner:
         """Make the algorithm, and resume, to the bit, from where it was saved in the middle of a training.
 
-        A learner of a stack loads its state at once, one that learns by itself at its first barrier.
-
-        Raises:
-            RunError: if a file is missing, cannot be read, or is of another learner.
+        A learner of a stack loads its state at once, one that learns by itself at its first barrier. Errors are those
+        of ``take``.
         """
         self.build()
         state, log = read_tree(folder, f"{self.name}.state"), read_tree(folder, f"{self.name}.journal")

@@ -29,9 +29,9 @@ from stable_baselines3.common.utils import set_random_seed
 from cirl_marl.environments.state import Snapshot, State
 from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, ControlError, LearnerError
-from cirl_marl.learners.agent_env import AgentVecEnv, BatchedEnv, JointStep
+from cirl_marl.learners.agent_env import AgentVecEnv, JointStep
 from cirl_marl.learners.barrier import CheckpointBarrier
-from cirl_marl.learners.views import OneAgent, View
+from cirl_marl.learners.views import BatchedEnv, OneAgent, View
 
 _IN_USE = threading.Lock()
 

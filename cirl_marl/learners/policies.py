@@ -1,4 +1,4 @@
-"""Policies that act together by the means of their actions, as a controller."""
+"""Policies: with a central critic; trained ones as a controller, all acting together, or as a function of rows."""
 
 from __future__ import annotations
 
@@ -8,9 +8,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from numpy.typing import NDArray
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import MultiInputActorCriticPolicy
+from stable_baselines3.common.torch_layers import MlpExtractor
 from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.controllers.basic import Arrays, Controller
@@ -62,6 +65,39 @@ class Policies(Controller):
         return actions
 
 
+class _LocalActor(MlpExtractor):
+    """Two networks on observation and state side by side: the actor's reads the first ``local`` entries only."""
+
+    def __init__(self, local: int, features: int, **options: Any) -> None:
+        super().__init__(features, **options)
+        self.local = local
+        self.policy_net = MlpExtractor(local, **options).policy_net
+
+    def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
+        return super().forward_actor(features[:, : self.local])
+
+
+class CentralCriticPolicy(MultiInputActorCriticPolicy):
+    """Actor-critic policy with a central critic: the actor sees its agent's observation, the critic the state as well.
+
+    For any on-policy algorithm of Stable-Baselines3 whose policies are its ``ActorCriticPolicy`` (PPO, A2C, TRPO). With
+    a policy that all agents share and PPO this is MAPPO (Yu et al. 2022, The Surprising Effectiveness of PPO in
+    Cooperative Multi-Agent Games, arXiv 2103.01955). The environment is seen as a dict of ``observation`` and ``state``
+    (``View.with_state``); no gradient of the actor reaches the critic or the reverse.
+    """
+
+    def _build_mlp_extractor(self) -> None:
+        assert isinstance(self.observation_space, spaces.Dict)
+        observation = self.observation_space["observation"]
+        self.mlp_extractor = _LocalActor(
+            spaces.flatdim(observation),  # "observation" comes before "state" in the features: keys are sorted
+            self.features_dim,
+            net_arch=self.net_arch,
+            activation_fn=self.activation_fn,
+            device=self.device,
+        )
+
+
 class DifferentiablePolicy(torch.nn.Module):
     """What a policy does deterministically, before it is clipped to [−1, 1], as a function of rows of its view.
 
@@ -97,7 +133,7 @@ class DifferentiablePolicy(torch.nn.Module):
             rows = ((rows - mean) / spread).clamp(-clip, clip).to(rows.dtype)
         inputs: Any = rows
         if self._view.state_entries:
-            # no action depends on the state (``central_critic``)
+            # no action depends on the state (``CentralCriticPolicy``)
             inputs = {"observation": rows, "state": rows.new_zeros((len(rows), self._view.state_entries))}
         policy: Any = self._policy
         if not self.remembers:

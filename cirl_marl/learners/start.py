@@ -12,7 +12,6 @@ import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
@@ -54,7 +53,9 @@ def _begin_from(run: RunDirectory, name: str, learner: Learner, env: MultiAgentV
     view = learner.agent_env.view
     _refuse(f"{run.path}: '{name}'", [*_other_settings(group.spec, learner.spec)])
     entries = (_entries(source, group.agents, learner.spec), _entries(env, view.agents, learner.spec))
-    _refuse(f"{run.path}: '{name}'", [*_other_entries(*entries), *_other_actions(group.view(source), view)])
+    actions, actions_here = group.view(source).action_space, view.action_space
+    other_actions = [] if actions == actions_here else [f"acts in {actions}, not in {actions_here}"]
+    _refuse(f"{run.path}: '{name}'", [*_other_entries(*entries), *other_actions])
     source_learner = load_acting_learner(folder, group, source)
     _refuse(f"{folder / name}.json:", [*_other_shapes(source_learner.model, learner.model)])
     _take_over(source_learner, learner)
@@ -131,11 +132,6 @@ def _other_entries(source: Mapping[str, Bounds], target: Mapping[str, Bounds]) -
 def _first_names(names: Sequence[str]) -> str:
     more = f" and {len(names) - NAMES_LISTED} more" if len(names) > NAMES_LISTED else ""
     return ", ".join(f"'{name}'" for name in names[:NAMES_LISTED]) + more
-
-
-def _other_actions(source: Any, target: Any) -> Iterator[str]:
-    if source.action_space != target.action_space:
-        yield f"acts in {source.action_space}, not in {target.action_space}"
 
 
 def _other_shapes(source: BaseAlgorithm, target: BaseAlgorithm) -> Iterator[str]:

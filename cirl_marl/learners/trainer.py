@@ -365,11 +365,8 @@ def run_together(
 ) -> None:
     """Train to the end of the budget; several trainings step by step together, learners of all of them stacked.
 
-    Args:
-        trainings: of the same recipe, steps and copies.
-        callbacks: Stable-Baselines3 callbacks by name of the learner; those who have one run in lockstep.
-        report: called after every joint step of the first training.
-        device: where stacked learners compute.
+    They have the same recipe, steps and copies; ``report`` is called after every joint step of the first of them.
+    ``callbacks`` and ``device`` are those of ``train``.
 
     Raises:
         LearnerError: if a learner fails; what was learnt is saved first, as it is after Ctrl-C.

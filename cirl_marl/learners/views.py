@@ -37,11 +37,26 @@ def rows_of(observation: Any, rows: Any) -> Any:
     return by_part(lambda part: part[rows], observation)
 
 
-class HasSpaces(Protocol):
-    """Whatever has a space for the observation and one for the action of each agent."""
+class BatchedEnv(Protocol):
+    """Several copies of an environment of many agents, all stepped at once; ``MultiAgentVectorEnv`` is one.
 
+    What it takes and gives is by agent, with a leading axis of ``num_envs`` entries. An episode that has ended is
+    followed by the next at once; what was seen last is ``final_obs`` in the infos.
+    """
+
+    num_envs: int
+    agents: tuple[str, ...]
     observation_spaces: Any
     action_spaces: Any
+
+    def reset(self, *, seed: Any = None) -> Any:
+        """Begin episodes in all copies and return the first observations."""
+
+    def step(self, actions: Any) -> Any:
+        """Move all copies; return observations, rewards, terminations, truncations and infos."""
+
+    def state(self) -> Floats:
+        """Return the whole state, for critics that see it."""
 
 
 class View(ABC):
@@ -98,7 +113,7 @@ class View(ABC):
 class OneAgent(View):
     """The view of a single agent: its own observation, action and reward, as they are."""
 
-    def __init__(self, env: HasSpaces, agent: str) -> None:
+    def __init__(self, env: BatchedEnv, agent: str) -> None:
         """View ``env`` as ``agent``."""
         self.agents, self.row_agents = (agent,), (agent,)
         self.observation_space = env.observation_spaces[agent]

@@ -14,8 +14,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor
 
-from cirl_marl.learners.central_critic import CentralCriticPolicy
 from cirl_marl.learners.learner import Learner
+from cirl_marl.learners.policies import CentralCriticPolicy
 from cirl_marl.learners.stacked.on_policy import RolloutStack
 from cirl_marl.learners.stacked.perceptrons import ACTIVATIONS, linear_layers
 from cirl_marl.learners.stacked.search import SearchStack, copies_per_candidate, parts_of

@@ -122,20 +122,16 @@ def linear_layers(network: nn.Module) -> tuple[list[nn.Linear], type[nn.Module] 
     return linear, kinds.pop() if kinds else None
 
 
+@dataclass(frozen=True, slots=True)
 class Field:
-    """Where a padded tensor stands in the rows of a matrix.
+    """Where a padded tensor of some shape stands in the rows of a matrix."""
 
-    Attributes:
-        first: its first column.
-    """
-
-    def __init__(self, columns: slice, shape: tuple[int, ...]) -> None:
-        """Stand in these columns, which hold a tensor of this shape."""
-        self._columns, self._shape, self.first = columns, shape, columns.start
+    columns: slice
+    shape: tuple[int, ...]
 
     def of(self, matrix: Tensor) -> Tensor:
         """Return it as a view of a matrix, shape (rows, …)."""
-        return matrix.detach()[:, self._columns].view(-1, *self._shape)
+        return matrix.detach()[:, self.columns].view(-1, *self.shape)
 
 
 class ParameterLayout:

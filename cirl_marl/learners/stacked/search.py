@@ -44,8 +44,8 @@ class SearchStack(Stack):
             for parameter, columns in self._layout.places(i):
                 self._centre[i, columns] = parameter.detach().flatten().to(self._device)
         self._columns = [torch.cat([c for _, c in self._layout.places(i)]) for i in range(len(members))]
-        source = members[0].spec.start
-        self._fixed_columns = None if source is None or not source.last_layer else slice(self._fields[-1][0].first)
+        source, last_layer = members[0].spec.start, self._fields[-1][0]
+        self._fixed_columns = slice(last_layer.columns.start) if source is not None and source.last_layer else None
         agent_env = members[0].agent_env
         self._rows, self._copies = agent_env.num_envs, agent_env.copies
         self._copies_per_candidate = copies_per_candidate(members[0])

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector.utils import create_empty_array
 from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import aec_to_parallel, turn_based_aec_to_parallel
@@ -75,8 +76,8 @@ class Copies:
         self.present = {name: np.zeros(num_envs, dtype=bool) for name in self.agents}
         self.masks: dict[str, NDArray[np.int8]] = {}
         self.new_episode = np.ones(num_envs, dtype=bool)
-        self._observations: dict[str, AgentObservations] = {
-            name: _blank(self.observation_spaces[name], num_envs) for name in self.agents
+        self._observations: dict[str, Any] = {
+            name: create_empty_array(space, num_envs) for name, space in self.observation_spaces.items()
         }
 
     def reset(self, *, seed: Sequence[int] | None = None) -> dict[str, AgentObservations]:
@@ -206,13 +207,6 @@ class AgentInCopy:
         if name.startswith("_") or name == "action_masks":
             raise AttributeError(name)
         return getattr(self.env, name)
-
-
-def _blank(space: spaces.Space[Any], copies: int) -> AgentObservations:
-    """Return zeros in the form of a space, for copies in which nothing was seen yet."""
-    if isinstance(space, spaces.Dict):
-        return {key: np.zeros((copies, *(part.shape or ())), dtype=part.dtype) for key, part in space.spaces.items()}
-    return np.zeros((copies, *(space.shape or ())), dtype=space.dtype)
 
 
 def _check(agent: str, space: spaces.Space[Any]) -> None:

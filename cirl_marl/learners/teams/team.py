@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path, PurePath
@@ -175,12 +176,12 @@ class Team:
         """
         if episodes < 1:
             raise CirlError(f"episodes must be at least 1, got {episodes}")
-        copies = Copies(self._make_env, min(episodes, self._copies.num_envs))
-        try:
-            with Streams(derived_seed(seed, "evaluation")).active(), one_torch_thread():
-                return self._play(copies, episodes, seed, deterministic)
-        finally:
-            copies.close()
+        with (
+            closing(Copies(self._make_env, min(episodes, self._copies.num_envs))) as copies,
+            Streams(derived_seed(seed, "evaluation")).active(),
+            one_torch_thread(),
+        ):
+            return self._play(copies, episodes, seed, deterministic)
 
     def _play(self, copies: Copies, episodes: int, seed: int, deterministic: bool) -> dict[str, NDArray[np.floating]]:
         count = copies.num_envs
