@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from greenlet import getcurrent
@@ -16,6 +15,7 @@ from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.learners.views import BatchedEnv, ObservedRows, View, by_part, rows_of
 from cirl_marl.network import Floats
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Compartment
 
 
@@ -24,29 +24,19 @@ def wait() -> None:
     getcurrent().parent.switch()
 
 
-@dataclass(frozen=True, slots=True)
+@positional_record
 class StepResult:
-    """The outcome of a joint step for one learner, one row for each row of its view.
-
-    Attributes:
-        observation: on which it acts next.
-        rewards: of the step.
-        dones: rows whose episode ended with it; all of them at a reset, after which episodes begin as well.
-        final_observation: the last one of the episodes that ended, anything in other rows; None if none ended.
-        returns: sum of the rewards of the episodes that ended, anything in other rows.
-        lengths: steps of these episodes.
-        truncated: rows whose episode a time limit ended; None if a time limit ended all of them.
-    """
+    """The outcome of a joint step for one learner, one row for each row of its view."""
 
     NAMES_IN_FILES: ClassVar = {"observation": "seen", "dones": "ended", "final_observation": "final"}
 
-    observation: ObservedRows
-    rewards: NDArray[np.float32]
-    dones: NDArray[np.bool_]
-    final_observation: ObservedRows | None = None
-    returns: Floats | None = None
-    lengths: NDArray[np.integer] | None = None
-    truncated: NDArray[np.bool_] | None = None
+    observation: Annotated[ObservedRows, "on which it acts next"]
+    rewards: Annotated[NDArray[np.float32], "of the step"]
+    dones: Annotated[NDArray[np.bool_], "rows whose episode ended with it; at a reset all, as episodes begin then too"]
+    final_observation: Annotated[ObservedRows | None, "the last of the episodes that ended, anything elsewhere"] = None
+    returns: Annotated[Floats | None, "sum of the rewards of the episodes that ended, anything in other rows"] = None
+    lengths: Annotated[NDArray[np.integer] | None, "steps of these episodes"] = None
+    truncated: Annotated[NDArray[np.bool_] | None, "rows whose episode a time limit ended; None: it ended all"] = None
 
     def state_dict(self) -> dict[str, Any]:
         """Return the parts by their names in files."""
@@ -63,29 +53,18 @@ _NO_STEP = StepResult(np.zeros(0), np.zeros(0, dtype=np.float32), np.zeros(0, dt
 """Before the joint environment is reset."""
 
 
-@dataclass(frozen=True, slots=True)
+@positional_record
 class JointStep:
-    """The outcome of a joint step for all agents.
+    """The outcome of a joint step for all agents."""
 
-    Attributes:
-        observations: of each agent, of the episodes that begin where one ended.
-        state: returns the state of the environment for critics.
-        rewards: of this step by agent, shape (B,).
-        dones: the copies in which the agent's episode ended, by agent, shape (B,).
-        truncated: those in which a time limit ended it, likewise.
-        returns: of the episodes so far by agent, shape (B,).
-        lengths: of the episodes so far, likewise.
-        infos: of the environment.
-    """
-
-    observations: Arrays
-    state: Callable[[], Floats]
-    rewards: Mapping[str, Floats]
-    dones: Mapping[str, NDArray[np.bool_]]
-    truncated: Mapping[str, NDArray[np.bool_]]
-    returns: Mapping[str, Floats]
-    lengths: Mapping[str, NDArray[np.integer]]
-    infos: Infos
+    observations: Annotated[Arrays, "of each agent, of the episodes that begin where one ended"]
+    state: Annotated[Callable[[], Floats], "returns the state of the environment for critics"]
+    rewards: Annotated[Mapping[str, Floats], "of this step by agent, shape (B,)"]
+    dones: Annotated[Mapping[str, NDArray[np.bool_]], "copies in which the agent's episode ended, shape (B,)"]
+    truncated: Annotated[Mapping[str, NDArray[np.bool_]], "those in which a time limit ended it, likewise"]
+    returns: Annotated[Mapping[str, Floats], "of the episodes so far by agent, shape (B,)"]
+    lengths: Annotated[Mapping[str, NDArray[np.integer]], "of the episodes so far, likewise"]
+    infos: Annotated[Infos, "of the environment"]
 
 
 class AgentInNetworkCopy:

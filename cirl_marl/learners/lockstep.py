@@ -16,8 +16,8 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import copy_context
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import fields
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -32,6 +32,7 @@ from cirl_marl.errors import CirlError, ControlError, LearnerError
 from cirl_marl.learners.agent_env import AgentVecEnv, JointStep
 from cirl_marl.learners.barrier import CheckpointBarrier
 from cirl_marl.learners.views import BatchedEnv, OneAgent, View
+from cirl_marl.network.declarations import positional_record
 
 _IN_USE = threading.Lock()
 
@@ -231,29 +232,18 @@ class NetworkWorld(World):
         self.joint_steps, self._returns, self._lengths = state["joint_steps"], state["returns"], state["lengths"]
 
 
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Participant:
-    """Who acts for one or more learners: a learner itself, or a stack of them.
+    """Who acts for one or more learners: a learner itself, or a stack of them."""
 
-    Attributes:
-        title: what messages call it.
-        learn: learns, waiting for each joint step; returns when it has learnt enough.
-        act: acts for ever, once ``learn`` is done, so that the others' world goes on.
-        streams: its random streams.
-        barriers: of each learner that it is.
-        busy: whether it will not come to a barrier before something is over.
-        budget: returns the joint steps after which it is stopped by ``BudgetSpent``, if it has not returned.
-        absent: whether it has nothing to do in the next joint step, and is not asked.
-    """
-
-    title: str
-    learn: Callable[[], None]
-    act: Callable[[], None]
-    streams: Streams
-    barriers: Sequence[CheckpointBarrier] = ()
-    busy: Callable[[], bool] = lambda: False
-    budget: Callable[[], int] = lambda: 2**62
-    absent: Callable[[], bool] = lambda: False
+    title: Annotated[str, "what messages call it"]
+    learn: Annotated[Callable[[], None], "learns, waiting for each joint step; returns when it has learnt enough"]
+    act: Annotated[Callable[[], None], "acts for ever, once ``learn`` is done, so that the others' world goes on"]
+    streams: Annotated[Streams, "its random streams"]
+    barriers: Annotated[Sequence[CheckpointBarrier], "of each learner that it is"] = ()
+    busy: Annotated[Callable[[], bool], "whether it comes to no barrier before something is over"] = lambda: False
+    budget: Annotated[Callable[[], int], "joint steps after which ``BudgetSpent`` stops it"] = lambda: 2**62
+    absent: Annotated[Callable[[], bool], "whether it has nothing to do in the next step"] = lambda: False
 
 
 class Lockstep:

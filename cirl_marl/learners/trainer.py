@@ -7,11 +7,10 @@ import threading
 import time
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -31,6 +30,7 @@ from cirl_marl.learners.stacked.conditions import obstacle, stacks
 from cirl_marl.learners.stacked.stack import Stack
 from cirl_marl.learners.start import begin_again, begin_from
 from cirl_marl.learners.validation import MULTIPLIER_FROM, Score, ServiceMultiplier, validation_score
+from cirl_marl.network.declarations import positional_record
 
 CHECKPOINTS = 10
 """Checkpoints of a run, evenly spaced."""
@@ -48,24 +48,16 @@ COST = 0.02
 """Part of the time that checkpoints may take; they come less often if the last one took more."""
 
 
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Progress:
-    """What a running training reports.
+    """What a running training reports."""
 
-    Attributes:
-        env_steps: environment steps done in this call, summed over the copies, of ``total``.
-        seconds: since training began.
-        circularity: mean over the copies of λ at the end of the last step, or λ̄ of the last episode; mass.
-        service_level: likewise.
-        episode: whether the two figures are those of a finished episode.
-    """
-
-    env_steps: int
+    env_steps: Annotated[int, "environment steps done in this call, summed over the copies, of ``total``"]
     total: int
-    seconds: float
-    circularity: float
-    service_level: float
-    episode: bool
+    seconds: Annotated[float, "since training began"]
+    circularity: Annotated[float, "mean over copies of λ at the end of the last step, or λ̄ of the last episode; mass"]
+    service_level: Annotated[float, "likewise"]
+    episode: Annotated[bool, "whether the two figures are those of a finished episode"]
 
 
 TrainingReport = Callable[[Progress], None]

@@ -10,9 +10,8 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from cirl_marl.controllers.rollout import rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import RunError
 from cirl_marl.learners.policies import Policies
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.records.files import write_json
 
 FIRST_SEED = 2**40
@@ -29,23 +29,16 @@ QUANTILE_95 = 1.645
 """Standard errors by which a service must exceed what is demanded, so that it does so in 95 of 100 evaluations."""
 
 
-@dataclass(frozen=True, slots=True)
+@positional_record
 class Score:
-    """Figures of a validation.
-
-    Attributes:
-        circularity: mean λ̄ of the episodes; mass.
-        service: mean level of the service that lacks most; 1 without services.
-        service_bound: lower confidence bound of that level, one-sided at 95 %.
-        episode_return: mean return of an episode, summed over the agents.
-    """
+    """Figures of a validation."""
 
     NAMES_IN_FILES: ClassVar = {"service_bound": "assured", "episode_return": "paid"}
 
-    circularity: float
-    service: float
-    service_bound: float
-    episode_return: float
+    circularity: Annotated[float, "mean λ̄ of the episodes; mass"]
+    service: Annotated[float, "mean level of the service that lacks most; 1 without services"]
+    service_bound: Annotated[float, "lower confidence bound of that level, one-sided at 95 %"]
+    episode_return: Annotated[float, "mean return of an episode, summed over the agents"]
 
     def rank(self, min_service: float | None) -> tuple[bool, float]:
         """Return the key by which scores are compared, the higher the better.

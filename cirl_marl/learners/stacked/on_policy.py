@@ -6,7 +6,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from torch import Tensor
 from cirl_marl.learners.learner import Learner
 from cirl_marl.learners.stacked.perceptrons import Weights, pieces
 from cirl_marl.learners.stacked.stack import Stack
+from cirl_marl.network.declarations import with_field_docs
 
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 FIGURES = ("policy_gradient_loss", "clip_fraction", "approx_kl", "value_loss")
@@ -28,27 +29,20 @@ EPISODES = 100
 """Last episodes whose mean return is logged, as Stable-Baselines3 does."""
 
 
+@with_field_docs
 @dataclass(slots=True)
 class Samples:
     """Samples of N learners: a rollout, shapes (N, B, T) for T steps of B rows, or a minibatch, shapes (N, samples).
 
     Entries, where there are some, are on a last axis.
-
-    Attributes:
-        observations: normalised.
-        actions: not clipped.
-        values: of the critic.
-        log_probabilities: of the actions.
-        advantages: generalised advantage estimates.
-        returns: values plus advantages, the targets of the critic.
     """
 
-    observations: Tensor
-    actions: Tensor
-    values: Tensor
-    log_probabilities: Tensor
-    advantages: Tensor
-    returns: Tensor
+    observations: Annotated[Tensor, "normalised"]
+    actions: Annotated[Tensor, "not clipped"]
+    values: Annotated[Tensor, "of the critic"]
+    log_probabilities: Annotated[Tensor, "of the actions"]
+    advantages: Annotated[Tensor, "generalised advantage estimates"]
+    returns: Annotated[Tensor, "values plus advantages, the targets of the critic"]
 
     def minibatch(self, learners: slice, order: Tensor) -> Samples:
         """Return samples of some learners by their indices, shape (learners, samples), of all B·T, row by row."""
