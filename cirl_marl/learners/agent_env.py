@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -40,7 +41,7 @@ class StepResult:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the parts by their names in files."""
-        return {self.NAMES_IN_FILES.get(name, name): getattr(self, name) for name in self.__slots__}
+        return {self.NAMES_IN_FILES.get(part.name, part.name): getattr(self, part.name) for part in fields(self)}
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> StepResult:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, ClassVar
 
@@ -53,7 +54,7 @@ class Score:
 
     def figures(self) -> dict[str, float]:
         """Return the figures by their names in files."""
-        return {self.NAMES_IN_FILES.get(name, name): getattr(self, name) for name in self.__slots__}
+        return {self.NAMES_IN_FILES.get(part.name, part.name): getattr(self, part.name) for part in fields(self)}
 
     @classmethod
     def from_figures(cls, figures: Mapping[str, float]) -> Score:
