@@ -18,7 +18,6 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.learners.checkpoint import observation_statistics
 from cirl_marl.learners.views import View, unseen_state
 
 
@@ -112,8 +111,10 @@ class DifferentiablePolicy(torch.nn.Module):
         self._policy.set_training_mode(False)
         normaliser = policy.normaliser
         self._normaliser: tuple[torch.Tensor, torch.Tensor, float] | None = None
-        if normaliser is not None:
-            statistics = observation_statistics(normaliser).get("observation")
+        if normaliser is not None and normaliser.norm_obs:
+            statistics: Any = normaliser.obs_rms
+            if isinstance(statistics, dict):
+                statistics = statistics.get("observation")
             if statistics is not None:
                 spread = (torch.as_tensor(statistics.var) + normaliser.epsilon).sqrt()
                 self._normaliser = torch.as_tensor(statistics.mean), spread, normaliser.clip_obs
