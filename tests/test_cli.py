@@ -514,7 +514,7 @@ def test_demo_trains_compares_and_opens_its_report(
 
     monkeypatch.setattr("webbrowser.open", open_)
     monkeypatch.setattr(demonstration, "NETWORK", "bottles.toml")
-    monkeypatch.setattr(demonstration, "COMPARED", 4)
+    monkeypatch.setattr(demonstration, "COMPARISON_EPISODES", 4)
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.delenv("DISPLAY", raising=False)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 @app.command("networks", rich_help_panel=NETWORKS)
 def list_networks(
-    every: Annotated[
+    every_region: Annotated[
         bool, typer.Option("--all", help="A row for each region of a definition that has regions.")
     ] = False,
 ) -> None:
@@ -39,7 +39,7 @@ def list_networks(
     from cirl_marl.definitions.catalogue import definitions, recipes
     from cirl_marl.report.terminal import networks_table
 
-    console.print(networks_table(definitions(), every=every))
+    console.print(networks_table(definitions(), all_regions=every_region))
     console.print(f"recipes for --recipe: {', '.join(recipes())}")
 
 

@@ -310,7 +310,7 @@ class Gaussians:
 def knot_counts(knots: int, iterations: int) -> list[int]:
     """Return the number of knots in each iteration: 1, then ``knots`` halved as often as it can be, up to ``knots``.
 
-    >>> stages(12, 8)
+    >>> knot_counts(12, 8)
     [1, 1, 3, 3, 6, 6, 12, 12]
     """
     counts = [knots]

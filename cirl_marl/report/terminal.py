@@ -31,8 +31,8 @@ def text_table(
     return table
 
 
-def networks_table(definitions: Mapping[str, Definition], *, every: bool = False) -> Table:
-    """One row a definition, by its name, or ``every`` region of it: compartments, agents, services, scenarios.
+def networks_table(definitions: Mapping[str, Definition], *, all_regions: bool = False) -> Table:
+    """One row a definition, or with ``all_regions`` one a region: compartments, agents, services, scenarios.
 
     They are counted in what the definition says: no network is built, which takes seconds.
     """
@@ -46,7 +46,7 @@ def networks_table(definitions: Mapping[str, Definition], *, every: bool = False
         more = [f"{len(services) - 2} more"] if len(services) > 2 else []
         cells = [str(len(compartments)), str(len(agents)), ", ".join(services[:2] + more), ", ".join(definition.names)]
         names = {f"{name}_{region}": text for region, text in regions.items()} or {name: ""}
-        if regions and not every:
+        if regions and not all_regions:
             names = {f"{name}_* ({len(regions)} regions)": "a region"}
         rows += [[label, document["title"].replace(REGION, text), *cells] for label, text in names.items()]
     return text_table("Networks", headings, rows, text=headings, unbroken=["name"])
