@@ -22,7 +22,6 @@ from cirl_marl.optimum.options import (
     by_stage,
     check_options,
     check_service,
-    check_stocks,
     demanded_levels,
     levels_text,
     starting_stocks,
@@ -134,8 +133,8 @@ class Envelope:
         """Return the least of the bounds that the members prove; see ``Bound.at``, whose defaults are the first's."""
         first = self.members[0]
         admissible = Admissible.of(first.network, first.agents or None)
-        state_layout = admissible.lifetimes.state_layout
-        starts = by_stage(first.network, state_layout, first.initial if initial is None else initial)
+        layout = admissible.lifetimes.state_layout
+        starts = by_stage(first.network, layout, first.initial if initial is None else initial)
         demand = first.min_service
         if min_service is not None:
             if demand is None:
@@ -148,7 +147,6 @@ class Envelope:
         levels = None if demand is None else np.broadcast_to(demand, (*shape, demand.shape[-1]))
         bounds = np.empty(shape)
         for i in np.ndindex(shape):
-            check_stocks(state_layout, starts[i])
             problem = programs.program(starts[i], None if levels is None else levels[i])
             bounds[i] = min(verify(problem, member.certificate, member.solution).bound for member in self.members)
         return bounds
@@ -234,19 +232,16 @@ def envelope(
     levels = None if min_service is None else demanded_levels(admissible.network, min_service, (len(starts),))
     programs = Programs(admissible, degree, service_weight)
 
-    def solve_from(start: Floats, demand: Floats | None, basis: Basis | None) -> Bound:
-        check_stocks(lifetimes.state_layout, start)
-        return _solve_bound(programs, start, service_weight, demand, basis)
-
-    basis = None if near is None else near.basis
-    first = solve_from(starts.mean(axis=0), None if levels is None else levels.mean(axis=0), basis)
+    demand, basis = None if levels is None else levels.mean(axis=0), None if near is None else near.basis
+    first = _solve_bound(programs, starts.mean(axis=0), service_weight, demand, basis)
     progress(1)
     bounds, candidates = Envelope((first,)), np.ones(len(starts), dtype=bool)
     for count in range(min(solves - 1, len(starts))):
         worst = int(np.where(candidates, bounds.at(starts, levels), np.inf).argmin())
         candidates[worst] = False
         demand = None if levels is None else levels[worst]
-        bounds = Envelope((*bounds.members, solve_from(starts[worst], demand, first.basis)))
+        member = _solve_bound(programs, starts[worst], service_weight, demand, first.basis)
+        bounds = Envelope((*bounds.members, member))
         progress(count + 2)
     return bounds
 

@@ -38,9 +38,7 @@ def starting_stocks(lifetimes: Lifetimes, initial: Mapping[str, float] | ArrayLi
         start = np.asarray(initial, dtype=float)
         if start.ndim != 1:
             raise CirlError(f"initial has shape {start.shape}, expected {(len(stores),)}")
-    start = by_stage(network, lifetimes.state_layout, start)
-    check_stocks(lifetimes.state_layout, start)
-    return start
+    return by_stage(network, lifetimes.state_layout, start)
 
 
 def check_options(service_weight: float | None, min_service: ArrayLike | None, degree: int) -> None:
@@ -65,30 +63,22 @@ def by_stage(network: Network, state_layout: StateLayout, stocks: ArrayLike) -> 
     What is given by stage already stays as it is; the others are spread by history or growth.
 
     Raises:
-        CirlError: for another shape.
+        CirlError: for another shape, or a stock that no episode can start from, negative or not finite.
     """
     masses, count, rows = np.asarray(stocks, dtype=float), len(network.stores), state_layout.nodes.stop
-    if masses.shape[-1:] == (rows,):
-        return masses.copy()
-    if masses.shape[-1:] != (count,):
+    if masses.shape[-1:] not in ((rows,), (count,)):
         raise CirlError(f"initial has shape {masses.shape}, expected (..., {count})")
     staged_masses = np.zeros((*masses.shape[:-1], rows))
-    staged_masses[..., :count] = masses
-    for i, stages in state_layout.stages.items():
-        shares = age_shares(network.stores[i], network.episode.control_interval)
-        staged_masses[..., stages] = masses[..., i, None] * shares
+    staged_masses[..., : masses.shape[-1]] = masses
+    if masses.shape[-1] != rows:
+        for i, stages in state_layout.stages.items():
+            shares = age_shares(network.stores[i], network.episode.control_interval)
+            staged_masses[..., stages] = masses[..., i, None] * shares
+    wrong = np.argwhere(~((staged_masses >= 0) & (staged_masses < math.inf)))
+    if len(wrong):
+        stock, name = staged_masses[tuple(wrong[0])], state_layout.start_names[wrong[0, -1]]
+        raise CirlError(f"initial: the stock of '{name}' is {stock}; it must be finite and not negative")
     return staged_masses
-
-
-def check_stocks(state_layout: StateLayout, stocks: Floats) -> None:
-    """Refuse stocks that no episode can start from.
-
-    Raises:
-        CirlError: naming a stock that is negative or not finite.
-    """
-    for name, stock in zip(state_layout.start_names, stocks.tolist(), strict=False):
-        if not 0 <= stock < math.inf:
-            raise CirlError(f"initial: the stock of '{name}' is {stock}; it must be finite and not negative")
 
 
 def check_service(min_service: ArrayLike) -> None:

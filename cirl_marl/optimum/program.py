@@ -28,7 +28,7 @@ from cirl_marl.optimum.constraints import (
 )
 from cirl_marl.optimum.matrices import ChainedRows, Layout, ProgramRows
 from cirl_marl.optimum.quasi_steady import decay_rows, end_laws, has_fast_stocks, quasi_steady_rows
-from cirl_marl.optimum.reach import ComparisonSystem, DelayLine, Reach
+from cirl_marl.optimum.reach import ComparisonSystem, Reach
 from cirl_marl.optimum.vintages import Lifetimes
 
 LARGE = 30_000
@@ -166,22 +166,18 @@ class Programs:
 
 def _reach(lifetimes: Lifetimes, system: ComparisonSystem, initial: Floats, intervals: range) -> tuple[Reach, Floats]:
     """Return what the planned network can reach, and the most that leaves lifetimes, shape (steps, lifetimes)."""
-    interval = lifetimes.network.episode.control_interval
-    lines = {
-        passive.reached_arc: DelayLine(passive.reached_arc, passive.reached_node, passive.slots(initial), interval)
-        for passive in lifetimes.passive
-        if not len(passive.rate)
-    }
-    reach = system.reach(lifetimes.start_reached @ initial, intervals, list(lines.values()))
+    interval, steps = lifetimes.network.episode.control_interval, range(len(intervals))
+    lines = [(passive, passive.slots(initial)) for passive in lifetimes.passive if not len(passive.rate)]
+    reach = system.reach(lifetimes.start_reached @ initial, intervals, lines)
     most = [
         passive.rate[intervals.start : intervals.stop] * reach.upper[:, passive.reached_node]
         + passive.chain.weights[0] * reach.upper[:, passive.reached_entry]
         if len(passive.rate)
-        else np.array([lines[passive.reached_arc].most(t, reach.inflow) for t in range(len(intervals))])
+        else np.array([passive.most_out(passive.slots(initial), t, reach.inflow) for t in steps]) / interval
         for passive in lifetimes.passive
     ]
     upper = reach.upper @ lifetimes.nodes_reached.T
-    lifetime_flow = np.array(most).reshape(len(most), len(intervals)).T
+    lifetime_flow = np.array(most).reshape(len(most), len(steps)).T
     return Reach(upper, reach.uncut[:, lifetimes.arcs_reached], reach.inflow), lifetime_flow
 
 

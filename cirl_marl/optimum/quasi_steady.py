@@ -101,7 +101,7 @@ class _DecayChains:
         rows.at_start(start, piece, nodes, means[:, 0])
         rows.put(start, layout.stock[moment] + nodes, -1.0)
         self._put_schedules(start, nodes, -delays[:, 0])
-        self._write_steps(nodes, -1, nodes, np.ones(len(nodes)), nodes, np.zeros(len(nodes)), 1.0)
+        self._write_steps(nodes, -1, [(nodes, 1.0)], 1.0)
         end = rows.add(1, nodes, piece, -1, d + 1)
         ratio = means[:, d + 1] / means[:, d]  # (X_d + U η_d)/ω_d ≤ (x_end + U η_end)/e^{−kδ}, times e^{−kδ}
         rows.put(end, layout.stock[moment + d] + nodes, ratio)
@@ -109,13 +109,7 @@ class _DecayChains:
         self._put_schedules(end, nodes, ratio * delays[:, d] - delays[:, d + 1])
 
     def write_factors(
-        self,
-        nodes: Integers,
-        quantity: Integers,
-        column: Integers,
-        driver: Integers,
-        factor: Floats,
-        scale: float | Floats,
+        self, nodes: Integers, quantity: Integers, column: Integers, driver: Integers, factor: Floats, scale: Any
     ) -> None:
         """Write the chains of (w − w̲)·x and (w̄ − w)·x, with w in ``factor`` and w·x and x in given columns.
 
@@ -131,21 +125,13 @@ class _DecayChains:
         nodes, quantity, column, driver = (part[free] for part in (nodes, quantity, column, driver))
         low, high = factor[:, free]
         spread = (high - low) * np.broadcast_to(scale, free.shape)[free]
-        weight = np.ones(len(nodes))
-        self._write_steps(nodes, 2 * quantity, column, weight, driver, -low, spread)
-        self._write_steps(nodes, 2 * quantity + 1, column, -weight, driver, high, spread)
+        self._write_steps(nodes, 2 * quantity, [(column, 1.0), (driver, -low)], spread)
+        self._write_steps(nodes, 2 * quantity + 1, [(column, -1.0), (driver, high)], spread)
 
     def _write_steps(
-        self,
-        nodes: Integers,
-        quantity: int | Integers,
-        column: Integers,
-        weight: Floats,
-        driver: Integers,
-        driver_weight: Floats,
-        spread: float | Floats,
+        self, nodes: Integers, quantity: int | Integers, terms: list[tuple[Integers, Any]], spread: float | Floats
     ) -> None:
-        """Write ω_{i+1}/ω_i·q_i − q_{i+1} − spread·U·(…) ≤ 0 for q the weighted sum of two columns of a moment."""
+        """Write ω_{i+1}/ω_i·q_i − q_{i+1} − spread·U·(…) ≤ 0 for q a sum of columns of a moment, each with a weight."""
         layout, rows = self.layout, self.rows
         piece, moment = np.arange(layout.pieces)[:, None], self.first[:, None]
         means, delays = self.means[nodes], self.delays[nodes]
@@ -153,9 +139,9 @@ class _DecayChains:
             # (q_i + U η_i)/ω_i ≤ (q_{i+1} + U η_{i+1})/ω_{i+1}, times ω_{i+1}
             ratio = means[:, i + 1] / means[:, i]
             row = rows.add(1, nodes, piece, quantity, i + 1)
-            for place, factor in ((moment + i, ratio), (moment + i + 1, -1.0)):
-                rows.put(row, layout.stock[place] + column, factor * weight)
-                rows.put(row, layout.stock[place] + driver, factor * driver_weight)
+            for column, weight in terms:
+                rows.put(row, layout.stock[moment + i] + column, ratio * weight)
+                rows.put(row, layout.stock[moment + i + 1] + column, -weight)
             self._put_schedules(row, nodes, spread * (ratio * delays[:, i] - delays[:, i + 1]))
 
     def _put_schedules(self, row: Integers, nodes: Integers, weight: Floats) -> None:

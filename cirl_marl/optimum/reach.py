@@ -21,6 +21,7 @@ from cirl_marl.dynamics.visit_bounds import VisitBounds
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import Admissible, IntervalRanges, NoCertificate
+from cirl_marl.optimum.vintages import PassiveLifetime
 
 DENSE = 256
 """Rows of the largest system whose solution is kept as matrices."""
@@ -162,21 +163,6 @@ class Reach:
     inflow: Annotated[Floats, "most that enters each stock in each interval, shape (steps, stores), mass"]
 
 
-@positional_record
-class DelayLine:
-    """What comes out of a fixed lifetime."""
-
-    arc: Annotated[int, "through which it comes out"]
-    node: Annotated[int, "from which"]
-    slots: Annotated[Floats, "what is in it at the start, first what comes out first, mass"]
-    interval: Annotated[float, "length of an interval"]
-
-    def most(self, step: int, inflow: Floats) -> float:
-        """Return the most that comes out in an interval, given the ``inflow`` in those before, mass/time."""
-        delay = len(self.slots)
-        return float(self.slots[step] if step < delay else inflow[step - delay, self.node]) / self.interval
-
-
 class ComparisonSystem:
     """The comparison system, advanced by the substeps of the simulator, in which scheduled flows are constant.
 
@@ -200,24 +186,28 @@ class ComparisonSystem:
         self._widest = max(widths, key=lambda kind: widths[kind])
         self._linear: dict[int, Linear] = {}
 
-    def reach(self, initial: Floats, intervals: range, delay_lines: Sequence[DelayLine] = ()) -> Reach:
+    def reach(
+        self, initial: Floats, intervals: range, delay_lines: Sequence[tuple[PassiveLifetime, Floats]] = ()
+    ) -> Reach:
         """Bound the stocks from ``initial``, shape (stores,), on, over the given intervals of the episode.
 
-        What comes out of ``delay_lines`` is at most what entered so many intervals before.
+        What comes out of ``delay_lines``, fixed lifetimes and what is in their slots, is at most what entered so many
+        intervals before.
 
         Raises:
             NoCertificate: if recipients may pull more from a node than it holds: the solver then departs from the laws.
         """
         network, schedules = self.network, self.admissible.by_schedule
         nodes, stores, steps = len(network.nodes), len(network.stores), len(intervals)
+        duration = network.episode.control_interval
         mass = float(initial.sum()) * (1 + ROUNDING)
         lower, upper = initial.copy(), initial.copy()
         highest, inflow = np.zeros((steps, nodes)), np.zeros((steps, stores))
         uncut = np.ones((steps, len(network.arcs)), dtype=bool)
         for step, interval in enumerate(intervals):
             least, most = np.where(schedules, self.admissible.rate[:, interval], 0.0)
-            for line in delay_lines:
-                least[line.arc], most[line.arc] = 0.0, line.most(step, inflow)
+            for line, slots in delay_lines:
+                least[line.reached_arc], most[line.reached_arc] = 0.0, line.most_out(slots, step, inflow) / duration
             linear = self.of_kind(int(self.admissible.kinds[interval]))
             node_inflow, outflow = self._by_node(most)
             stock_inflow = linear.routes.most(node_inflow)
@@ -247,7 +237,7 @@ class ComparisonSystem:
             highest[step, stores:] = linear.routes.through(
                 node_inflow[stores:] + linear.pass_inflow @ highest[step, :stores]
             )
-        uncut[:, [line.arc for line in delay_lines]] = True  # a slot holds what comes out of it
+        uncut[:, [line.reached_arc for line, _ in delay_lines]] = True  # a slot holds what comes out of it
         return Reach(highest, uncut, inflow)
 
     def _by_node(self, flow: Floats) -> tuple[Floats, Floats]:

@@ -62,6 +62,10 @@ class PassiveLifetime:
         # what rounding left of what came out before comes with the oldest
         return np.concatenate([[masses[-2] + masses[-1]], masses[-3::-1]])
 
+    def most_out(self, slots: Floats, step: int, inflow: Floats) -> float:
+        """Return the most that comes out of a fixed one in an interval, given the ``inflow`` in those before, mass."""
+        return float(slots[step] if step < len(slots) else inflow[step - len(slots), self.reached_node])
+
 
 class Lifetimes:
     """A network as its program sees it: controlled lifetimes as chains, the others whole.
