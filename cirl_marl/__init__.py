@@ -13,7 +13,7 @@ Every name here is loaded when it is first asked for (PEP 562), so that importin
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from cirl_marl.environments.registration import register
+from cirl_marl.environments.registration import register as register
 
 if TYPE_CHECKING:
     from cirl_marl.controllers.basic import Constant as Constant
@@ -113,6 +113,7 @@ _MODULES = {
     "environments.goal": "GoalEnv",
     "environments.joint": "JointEnv JointVectorEnv",
     "environments.parallel": "NetworkParallelEnv aec_env parallel_env vector_env",
+    "environments.registration": "register",
     "environments.single": "SingleAgentEnv single_agent_env",
     "environments.state": "Snapshot",
     "environments.vector": "MultiAgentVectorEnv",
