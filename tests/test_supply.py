@@ -29,8 +29,8 @@ from cirl_marl import (
 )
 from cirl_marl.controllers import Constant, Neutral
 from cirl_marl.controllers.lint import lint_warnings
+from cirl_marl.controllers.outcome import service_shortages
 from cirl_marl.controllers.rollout import rollout
-from cirl_marl.controllers.shortages import service_shortages
 from cirl_marl.definitions.reader import write_network
 from cirl_marl.network import Network
 from cirl_marl.network.elements import Lifetime

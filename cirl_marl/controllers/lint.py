@@ -9,8 +9,8 @@ from functools import cache, partial
 import numpy as np
 
 from cirl_marl.controllers.basic import Constant, Controller, Neutral
+from cirl_marl.controllers.outcome import service_shortages, shortages
 from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
-from cirl_marl.controllers.shortages import service_shortages, shortages
 from cirl_marl.dynamics.laws import LAWS
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError

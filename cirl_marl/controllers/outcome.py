@@ -1,11 +1,24 @@
-"""What came of one episode, in sentences."""
+"""What came of one episode, in sentences: its figures, scheduled flows that were cut, and services that lacked.
+
+A scheduled flow is cut where its donor held too little; a service lacks though nobody could make up for it.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
 from cirl_marl.controllers.rollout import EpisodeStart, Rollout
-from cirl_marl.controllers.shortages import service_shortages, shortages
+from cirl_marl.dynamics.laws import LAWS
 from cirl_marl.network import Network
 from cirl_marl.network.batch_circularity import CIRO_FACTOR
+from cirl_marl.network.calendar import labels
+from cirl_marl.network.elements import Arc
+
+NOTABLE = 1e-3
+"""Share of what was asked of a flow in an episode that is worth a word; plans are solved less accurately than run."""
 
 
 def outcome_lines(network: Network, run: Rollout, origin: EpisodeStart) -> list[str]:
@@ -27,3 +40,45 @@ def outcome_lines(network: Network, run: Rollout, origin: EpisodeStart) -> list[
 def shortage_lines(network: Network, run: Rollout) -> list[str]:
     """Return which flows and services were less than was asked for, as means over the episodes of a rollout."""
     return [*(shortage.description for shortage in shortages(run, network)), *service_shortages(run, network)]
+
+
+@dataclass(frozen=True, slots=True)
+class Shortage:
+    """A scheduled flow that was cut: which, when first, how much less came in all, and ``said``, this in words."""
+
+    arc: Arc
+    begins: float
+    mass: float
+    description: str
+
+
+def shortages(run: Rollout, network: Network) -> Iterator[Shortage]:
+    """Yield the scheduled flows that were cut in a rollout of ``network``; masses are means over its copies."""
+    interval = network.episode.control_interval
+    scheduled_arcs = [k for k, arc in enumerate(network.arcs) if LAWS[arc.law].is_scheduled]
+    for k, lack in zip(scheduled_arcs, run.shortage.T, strict=True):
+        mass = float(lack.sum())
+        order = mass + float(run.mean_flow[k]) * interval * len(lack)
+        if mass > NOTABLE * order:
+            arc, begins = network.arcs[k], float(np.argmax(lack > 0)) * interval
+            less = f"{mass:.4g} {network.mass_unit} ({mass / order:.1%}) less than asked for"
+            first = f"first at {begins:g} {network.time_unit}"
+            yield Shortage(arc, begins, mass, f"arc '{arc.id}' moved {less}, {first}: '{arc.donor}' held too little")
+
+
+def service_shortages(run: Rollout, network: Network) -> Iterator[str]:
+    """Yield the services that fell short in a rollout of ``network`` though arcs make up for them."""
+    interval = network.episode.control_interval
+    for s, service in enumerate(network.services):
+        arcs = [arc for arc in network.arcs if arc.makes_up_for == service.id]
+        levels = run.levels[:, s].mean(axis=0)
+        if arcs and levels.min() < 1 - NOTABLE:
+            first = int(np.argmax(levels < 1 - NOTABLE))
+            date = " ".join(f"({column[0]})" for column in labels(network, first * interval)[1])
+            at = f"{first * interval:g} {network.time_unit} {date}".strip()
+            flows = [f"'{arc.id}' {run.controls[first, network.control_rows[arc.id].start]:.4g}" for arc in arcs]
+            unit = f"{network.mass_unit}/{network.time_unit}"
+            text = (
+                f"falls to {levels.min():.4f}, short first at {at}, when {' and '.join(flows)} {unit} makes up for it"
+            )
+            yield f"service '{service.id}' {text}"
