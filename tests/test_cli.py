@@ -31,7 +31,7 @@ from cirl_marl.evaluation.assessment import evaluate
 from cirl_marl.learners.interface import train
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.optimum import search_each
-from cirl_marl.report import run as pictures
+from cirl_marl.report import presentation as pictures
 from cirl_marl.report import trajectory
 from cirl_marl.report.curves import save_trajectory
 

@@ -34,7 +34,7 @@ from cirl_marl.reasons.rules import distil_rules
 from cirl_marl.reasons.sentences import input_sentence, rule_sentences
 from cirl_marl.report.explanations import read_reasons, write_reasons
 from cirl_marl.report.page_html import page_html
-from cirl_marl.report.run import page_of_evaluation
+from cirl_marl.report.report_page import page_of_evaluation
 
 Floats = NDArray[np.floating]
 FIRST = first_seed(0)

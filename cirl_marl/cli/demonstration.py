@@ -6,16 +6,13 @@ import os
 import sys
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from cirl_marl.cli.common import LEARNERS, app, folder_for, say, training_bar
 from cirl_marl.cli.learning import evaluate_and_draw, what_is_kept
 from cirl_marl.errors import CirlError
-
-if TYPE_CHECKING:
-    from cirl_marl.learners.recipe import Recipe
 
 NETWORK, RECIPE, STEPS = "copper_net", "independent_ars", 4_000_000
 EVALUATIONS, EPISODES = 20, 256
@@ -52,6 +49,7 @@ def _train(out: Path, steps: int) -> None:
     """Train the team, or what is left of that."""
     from cirl_marl.definitions.catalogue import load_network
     from cirl_marl.learners.interface import complete_run
+    from cirl_marl.learners.recipe import load_recipe
     from cirl_marl.learners.run_directory import RunDirectory
 
     if (out / "config.json").is_file():
@@ -63,17 +61,10 @@ def _train(out: Path, steps: int) -> None:
             )
         if run.status["state"] == "complete":
             say(f"{out} is trained already; remove it to begin anew")
-    with training_bar() as report:
-        complete_run(out, NETWORK, _recipe(), steps=steps, seed=0, report=report)
-
-
-def _recipe() -> Recipe:
-    """Return the recipe with fewer evaluations."""
-    from cirl_marl.learners.recipe import load_recipe
-
     recipe = load_recipe(RECIPE)
     shorter = recipe.run.model_copy(update={"evaluations": EVALUATIONS, "episodes": EPISODES})
-    return recipe.model_copy(update={"run": shorter})
+    with training_bar() as report:
+        complete_run(out, NETWORK, recipe.model_copy(update={"run": shorter}), steps=steps, seed=0, report=report)
 
 
 def has_display() -> bool:

@@ -290,8 +290,8 @@ def evaluate_and_draw(directory: Path, episodes: int, seed: int, page: Path | No
     """Evaluate a run, say what came of it and draw its pictures; with ``page`` also hold it against the best."""
     from cirl_marl.evaluation import assessment
     from cirl_marl.evaluation.comparison import part_of
-    from cirl_marl.report.report_page import PLAN
-    from cirl_marl.report.run import draw_run, page_of_evaluation
+    from cirl_marl.report.presentation import draw_run
+    from cirl_marl.report.report_page import PLAN, page_of_evaluation
     from cirl_marl.report.terminal import evaluation_table
 
     share = 1.0 if page is None else EVALUATION_SHARE

@@ -25,17 +25,6 @@ if TYPE_CHECKING:
 ROWS = 30
 """Most rows of the live table; those at work come first."""
 ORDER = ("running", "elsewhere", "failed", "waiting", "done")
-OPTIONS_SHOWN: tuple[str, ...] = (
-    "steps",
-    "envs",
-    "engine",
-    "min_service",
-    "reward",
-    "observe",
-    "circularity_in_reward",
-)
-OPTIONS_SHOWN += ("circularity_weight", "horizon", "uncertain")
-"""Columns of the results that are shown if they differ between cells of one recipe."""
 
 
 @app.command(rich_help_panel=COMPARISONS)
@@ -185,11 +174,13 @@ def _steps(cell_status: CellStatus) -> str:
 
 def _results(rows: Sequence[Mapping[str, Any]]) -> Table:
     """Draw the results, with those options that were swept."""
+    from cirl_marl.sweeps.folder import OPTION_COLUMNS
+
     identity = ("network", "scenario", "recipe", "seed")
     recipes = {row["recipe"] for row in rows}
     columns = [
         *identity,
-        *(key for key in OPTIONS_SHOWN if len({(row["recipe"], row[key]) for row in rows}) > len(recipes)),
+        *(key for key in OPTION_COLUMNS if len({(row["recipe"], row[key]) for row in rows}) > len(recipes)),
     ]
     table = Table(*columns, "λ̄", "service", "gap to the bound")
     for row in rows:

@@ -6,19 +6,22 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 from rich.console import Group, RenderableType
 
+from cirl_marl.controllers.rollout import interval_ends
 from cirl_marl.controllers.schedule import Schedule
+from cirl_marl.drawing.digraph import save_before_after
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.assessment import Evaluation
 from cirl_marl.evaluation.comparison import Comparison
 from cirl_marl.evaluation.pareto import ParetoFront
 from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.report import report_page
+from cirl_marl.report.curves import save_circularity, save_learning_curves
 from cirl_marl.report.decisions import decisions_table, save_decisions, savings_table
 from cirl_marl.report.differences import save_alternatives
 from cirl_marl.report.page_html import write_page
-from cirl_marl.report.run import draw_circularity, page_of_evaluation
 from cirl_marl.report.terminal import evaluation_table
 from cirl_marl.report.tradeoffs import comparison_notes, comparison_table, save_comparison, save_pareto
 from cirl_marl.report.trajectory import draw_trajectory
@@ -60,6 +63,38 @@ def draw(path: str | Path, result: Reportable, *, title: str = "") -> Path:
     return _of_its_kind(_PICTURES, result, "picture")(Path(path), result, title=title)
 
 
+def draw_run(evaluation: Evaluation) -> list[Path]:
+    """Draw the network before and after, λ over time trained against neutral and random, and the learning curves.
+
+    There are no learning curves if no episode ended while training.
+    """
+    run, env, rollouts = evaluation.run, evaluation.env, evaluation.rollouts
+    folder = run.path / "pictures"
+    folder.mkdir(exist_ok=True)
+    network = env.network
+    before, after = rollouts["neutral"], rollouts["trained"]
+    first, last = ((rollout.final_stock, rollout.mean_flow) for rollout in (before, after))
+    labels = ("neutral: mean λ and flows, last stocks", "trained: mean λ and flows, last stocks")
+    means = float(before.episode_circularity.mean()), float(after.episode_circularity.mean())
+    flows = save_before_after(folder / "flows_before_after.png", network, first, last, labels, means)
+    circularity = draw_circularity(folder / "circularity.png", evaluation)
+    curves, metrics = folder / "learning_curves.png", run.metrics()
+    curves.unlink(missing_ok=True)
+    if not metrics["env_steps"]:
+        return [flows, circularity]
+    returns = {agent: np.array(metrics[f"return:{agent}"]) for agent in env.agents}
+    save_learning_curves(curves, np.array(metrics["env_steps"]), returns)
+    return [flows, circularity, curves]
+
+
+def draw_circularity(path: Path, evaluation: Evaluation, *, title: str = "") -> Path:
+    """Save λ and service level over time, trained beside neutral and random control, as a PNG; return its path."""
+    network, rollouts = evaluation.env.network, evaluation.rollouts
+    means = {name: rollout.circularity_mean for name, rollout in rollouts.items()}
+    services = {name: rollout.service for name, rollout in rollouts.items()}
+    return save_circularity(path, network, interval_ends(network), means, services)
+
+
 def summarise(result: object) -> RenderableType:
     """Return the tables and sentences that the command line shows of a result, for ``rich.print``.
 
@@ -81,7 +116,7 @@ _PAGES: Mapping[type, Callable[[Any], report_page.ReportPage]] = {
     Schedule: report_page.page_of_schedule,
     Comparison: report_page.page_of_comparison,
     ParetoFront: report_page.page_of_front,
-    Evaluation: page_of_evaluation,
+    Evaluation: report_page.page_of_evaluation,
 }
 _PICTURES: Mapping[type, Callable[..., Path]] = {
     Simulation: draw_trajectory,

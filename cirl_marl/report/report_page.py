@@ -14,6 +14,7 @@ from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.controllers.schedule import Schedule
 from cirl_marl.drawing.style import readable
 from cirl_marl.environments.vector import MultiAgentVectorEnv
+from cirl_marl.evaluation.assessment import CONTROLLERS, Evaluation
 from cirl_marl.evaluation.baselines import levels_to_demand
 from cirl_marl.evaluation.comparison import FIGURES, Comparison
 from cirl_marl.evaluation.pareto import ParetoFront
@@ -23,6 +24,7 @@ from cirl_marl.evaluation.statistics import SHARE, Aggregate, over_episodes
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.mpc import SERVICE_FIRST, Optimum
+from cirl_marl.report.explanations import read_reasons
 
 QUANTILES = (0.025, 0.5, 0.975)
 USUAL, PLAN = "business as usual", "plan of the bound"
@@ -171,6 +173,19 @@ def add_plan(
     notes = [*page.notes, f"{PLAN.capitalize()}: for the first episode, {condition}."]
     notes += [f"{optimum.note}."] if optimum.note else []
     return replace(page, episodes=(*page.episodes, episode), points=(*page.points, point), notes=tuple(notes))
+
+
+def page_of_evaluation(evaluation: Evaluation, progress: Callable[[float], None] = lambda share: None) -> ReportPage:
+    """Return the page of a run: business as usual, the policies, and the plan of the bound, which is solved here.
+
+    Reasons are on it if they were found of the checkpoint that acts; else it says how to find them. ``progress`` is
+    called with the share of the plan that is done.
+    """
+    run, comparison = evaluation.run, evaluation.comparison
+    page = page_of_comparison(comparison, without=CONTROLLERS[1:])
+    reasons, advice = read_reasons(run, comparison.entries[0].checkpoint)
+    notes = (*page.notes, f"{advice}.") if advice else page.notes
+    return add_plan(replace(page, reasons=reasons, notes=notes), comparison, run.make_env(1), progress)
 
 
 def page_of_front(front: ParetoFront) -> ReportPage:

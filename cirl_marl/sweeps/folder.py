@@ -23,7 +23,7 @@ from filelock import FileLock
 from cirl_marl.errors import RunError
 from cirl_marl.records.files import refuse_links, write_atomically, write_json, write_table
 from cirl_marl.sweeps.cells import Cell
-from cirl_marl.sweeps.reading import SweepFile
+from cirl_marl.sweeps.reading import SweepFile, SweepOptions
 
 INTERVALS = ("circularity", "service", "gap")
 MISMATCHES_SHOWN = 5
@@ -148,6 +148,8 @@ class SweepFolder:
 
 _ENVIRONMENT = {key: key for key in ("reward", "observe", "circularity_weight", "horizon", "uncertain")}
 _ENVIRONMENT |= {"circularity": "circularity_in_reward"}  # circularity itself is a result
+OPTION_COLUMNS = tuple(_ENVIRONMENT.get(name, name) for name in SweepOptions.model_fields)
+"""Columns of the options of a sweep file, in its order."""
 
 
 def _json(path: Path) -> dict[str, Any]:
