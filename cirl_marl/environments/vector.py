@@ -19,8 +19,7 @@ from cirl_marl.dynamics.integrator import Dynamics, Transition
 from cirl_marl.dynamics.supply import Supply
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.observations import ObservationLayout
-from cirl_marl.environments.rewards import Credit
-from cirl_marl.environments.scoring import Scoring
+from cirl_marl.environments.rewards import Credit, Scoring
 from cirl_marl.environments.starts import Starts
 from cirl_marl.environments.state import Outcome, Snapshot, State
 from cirl_marl.errors import CirlError, ControlError, unknown_name
@@ -58,7 +57,7 @@ class MultiAgentVectorEnv:
         network: the network under the chosen scenario.
         agents: compartments that act, in the order of every stacked array.
         uncertain: whether the uncertain numbers are drawn.
-        reward_mode: one of those of ``credit.Credit``.
+        reward_mode: one of those of ``rewards.Credit``.
         observation_spaces: by agent.
         observation_names: by agent, what each entry of its observation is.
         action_spaces: by agent; Box(−1, 1), mapped linearly to the bounds of the control.
