@@ -182,7 +182,7 @@ def test_a_product_has_the_mean_of_the_product(kinds: tuple[str, str]) -> None:
     edges = np.array([0.0, 0.7, 2.0, 2.25, 5.0, 6.5])
     fine = np.linspace(0.0, 6.5, 130_001)
     middles = (fine[:-1] + fine[1:]) / 2
-    both = per_head.begins(middles) * heads.begins(middles)
+    both = per_head.limits(middles, "right") * heads.limits(middles, "right")
     expected = [both[(middles > a) & (middles < b)].mean() for a, b in pairwise(edges.tolist())]
     np.testing.assert_allclose(product.means(edges), expected, rtol=1e-4)
     low, high = product.extremes

@@ -58,13 +58,6 @@ class DeliveryTruck(TransportTruck, Vehicle):
         in_motion = TransportTruck.derivative(self, state[:2], inputs, load_kg=load_kg)
         return np.concatenate([in_motion, np.zeros_like(state[2:])])
 
-    def reward(self, state: Floats, inputs: Floats) -> Floats:
-        """Return −((destination − x)² + 0.1 v² + weight·F²), shape (B,)."""
-        position_m, speed_m_s, destination_m = state
-        distance = (destination_m - position_m) ** 2
-        cost: Floats = distance + self.speed_weight * speed_m_s**2 + self.force_weight * inputs[0] ** 2
-        return -cost
-
     def can_board(self, state: Floats) -> NDArray[np.bool_]:
         """Return where the truck rests at the donor and heads nowhere, shape (B,)."""
         return self._at(state, 0.0)

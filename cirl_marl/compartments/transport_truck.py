@@ -64,8 +64,8 @@ class TransportTruck(ContinuousModel):
         return friction + drag
 
     def reward(self, state: Floats, inputs: Floats) -> Floats:
-        """Return −((x* − x)² + 0.1 v² + 0.001 F²), shape (B,)."""
-        position_m, speed_m_s = state
-        distance = (self.target_m - position_m) ** 2
+        """Return −((x* − x)² + 0.1 v² + 0.001 F²), shape (B,); x* is the third state if there is one."""
+        position_m, speed_m_s, *destination_m = state
+        distance = ((destination_m[0] if destination_m else self.target_m) - position_m) ** 2
         cost: Floats = distance + self.speed_weight * speed_m_s**2 + self.force_weight * inputs[0] ** 2
         return -cost

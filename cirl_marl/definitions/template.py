@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import re
+import sys
 import tempfile
 from pathlib import Path
 from typing import Annotated
@@ -31,15 +31,9 @@ class FirstCycle:
 
     def __post_init__(self) -> None:
         """Raise a ``CirlError`` for numbers that cannot be meant."""
-        for name, ok in {
-            "in_use": self.in_use > 0,
-            "lifetime": self.lifetime >= 1,
-            "recycled": 0 <= self.recycled <= 1,
-            "growth": -20 <= self.growth <= 20,
-            "years": 1 <= self.years <= 500,
-        }.items():
-            if not ok or not math.isfinite(getattr(self, name)):
-                raise CirlError(f"{name.replace('_', '-')} {getattr(self, name)}: {BOUNDS[name]}")
+        for name, (low, high, demand) in BOUNDS.items():
+            if not low <= getattr(self, name) <= high:
+                raise CirlError(f"{name.replace('_', '-')} {getattr(self, name)}: {demand}")
         if not re.sub(r"\W", "", self.material) or any(mark in self.material for mark in '"\\\n{}'):
             raise CirlError(f"material {self.material!r}: needs letters, without quotes and braces")
         if any(mark in self.mass for mark in '"\\\n'):
@@ -47,13 +41,13 @@ class FirstCycle:
 
 
 BOUNDS = {
-    "in_use": "a mass above 0",
-    "lifetime": "years, at least 1",
-    "recycled": "a share from 0 to 1",
-    "growth": "percent a year, from -20 to 20",
-    "years": "a number of years from 1 to 500",
+    "in_use": (sys.float_info.min, sys.float_info.max, "a mass above 0"),
+    "lifetime": (1, sys.float_info.max, "years, at least 1"),
+    "recycled": (0, 1, "a share from 0 to 1"),
+    "growth": (-20, 20, "percent a year, from -20 to 20"),
+    "years": (1, 500, "a number of years from 1 to 500"),
 }
-"""What each number must be."""
+"""Lowest and highest value of each number, and what it must be."""
 
 
 def write_first(cycle: FirstCycle, path: Path) -> None:

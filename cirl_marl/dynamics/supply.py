@@ -116,15 +116,10 @@ class Supply:
         if batch <= block:
             return self._controls_of_block(stock, inner, controls, step, idle, factors)
         parts = []
-        for first in range(0, batch, block):
-            columns = slice(first, first + block)
-            block_arrays = [np.ascontiguousarray(array[:, columns]) for array in (stock, inner, controls)]
-            block_factors = None if factors is None else np.ascontiguousarray(factors[:, columns])
-            parts.append(
-                self._controls_of_block(
-                    block_arrays[0], block_arrays[1], block_arrays[2], step[columns], idle[:, columns], block_factors
-                )
-            )
+        for columns in (slice(first, first + block) for first in range(0, batch, block)):
+            masses, states, others = (np.ascontiguousarray(array[:, columns]) for array in (stock, inner, controls))
+            draws = None if factors is None else np.ascontiguousarray(factors[:, columns])
+            parts.append(self._controls_of_block(masses, states, others, step[columns], idle[:, columns], draws))
         return np.concatenate(parts, axis=1)
 
     def _controls_of_block(
@@ -147,9 +142,6 @@ class Supply:
             target = np.minimum(low + self._weights * supply[self._of], high)
             all_controls[self._rows] = np.where(idle, target, controls[self._rows])
             return all_controls
-
-        def quantities_for(supply: Floats, times: int = 1) -> Floats:
-            return self._service_quantities(stock, inner, controls_for(supply), step, times, factors)
 
         def probed_slope(supply: Floats, base: Floats) -> Floats:
             """Return A, shape (services, services, B), from an interval for each column."""
@@ -175,7 +167,7 @@ class Supply:
         open_, factor = np.ones(batch, dtype=bool), np.ones((count, batch))
         before: tuple[Floats, Floats, Floats] | None = None
         for _ in range(ROUNDS):
-            base = quantities_for(supply)
+            base = self._service_quantities(stock, inner, controls_for(supply), step, 1, factors)
             shortage = demand - base
             lacks = (shortage > CLOSE * demand) & (supply < most) | (shortage < -CLOSE * demand) & (supply > 0)
             open_ &= lacks.any(axis=0)
@@ -203,10 +195,9 @@ class Supply:
     ) -> Floats:
         """Return what the services measure at the end of the interval under several controls, shape (services, …)."""
         dynamics = self._dynamics
-        start, factors_ = (np.tile(stock, (1, times)), np.tile(inner, (1, times))), None
-        if factors is not None:
-            factors_ = np.tile(factors, (1, times))
-        done = dynamics.advance(*start, controls, np.tile(step, times), factors_)
+        start = np.tile(stock, (1, times)), np.tile(inner, (1, times))
+        draws = None if factors is None else np.tile(factors, (1, times))
+        done = dynamics.advance(*start, controls, np.tile(step, times), draws)
         flow = done.moved_mass / dynamics.network.episode.control_interval
         return self._measure(np.concatenate([dynamics.rows.stocks(done.stock), flow]))
 

@@ -16,7 +16,7 @@ from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.importing.balances import Change, Processes, ProcessKind, Residual
-from cirl_marl.importing.definition import ImportedFiles, definition_files, identifiers
+from cirl_marl.importing.definition import DefinitionWriter, ImportedFiles, identifiers
 from cirl_marl.importing.flow_table import FlowTable, read_flows, read_stocks
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Role
@@ -101,15 +101,16 @@ def import_flows(
     name = identifiers([out.stem])[out.stem]
     if name != out.stem:
         raise CirlError(f"--out {out}: the name of a network has lower case letters, digits and _, as {name}.toml")
-    definition = definition_files(
-        table,
-        processes,
-        role_of,
-        known_stocks,
+    writer = DefinitionWriter(
+        table=table,
+        processes=processes,
+        roles=role_of,
+        stocks=known_stocks,
         name=name,
         title=title or name,
         source=source or f"imported from {flows.name}",
     )
+    definition = writer.files()
     with publish_folder(out.parent) as partial:
         files = _write(partial, out.name, name, definition, changes)
         error = _largest_error(partial / out.name, table, definition, progress)

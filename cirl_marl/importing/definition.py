@@ -14,7 +14,7 @@ import numpy as np
 from cirl_marl.importing.balances import Processes, ProcessKind
 from cirl_marl.importing.flow_table import Connection, FlowTable
 from cirl_marl.network import Floats
-from cirl_marl.network.declarations import positional_record
+from cirl_marl.network.declarations import positional_record, with_field_docs
 from cirl_marl.network.elements import Role
 
 
@@ -28,33 +28,6 @@ class ImportedFiles:
         list[list[object]], "by region reference flow and stock, and first stocks; empty without regions"
     ]
     arcs: Annotated[Mapping[Connection, str], "id of the arc of each pair"]
-
-
-def definition_files(
-    table: FlowTable,
-    processes: Processes,
-    roles: Mapping[str, Role],
-    stocks: Mapping[tuple[str, str, int], float],
-    *,
-    name: str,
-    title: str,
-    source: str,
-) -> ImportedFiles:
-    """Return the definition of a network whose neutral simulation gives back the flows of a table.
-
-    Flows from sources and stores are series; what passes through a process without stock is shared out as it was.
-    Where nothing passed, the shares are those of the nearest year with any, or of all regions together.
-
-    Args:
-        table: flows that balance.
-        processes: its processes.
-        roles: of sources, sinks and stores; those that are not named belong to the technosphere.
-        stocks: by region, process and year, in the unit of mass of the table; at the end of a year.
-        name: of the network, and of the data file.
-        title: in words.
-        source: where the numbers come from.
-    """
-    return _Writer(table, processes, roles, stocks, name, title, source).definition()
 
 
 def identifier(text: str) -> str:
@@ -98,18 +71,26 @@ def shares_of(flows: Floats) -> Floats:
     return np.asarray(shares)
 
 
-@dataclass
-class _Writer:
-    _table: FlowTable
-    _processes: Processes
-    _roles: Mapping[str, Role]
-    _stocks: Mapping[tuple[str, str, int], float]
-    _name: str
-    _title: str
-    _source: str
+@with_field_docs
+@dataclass(kw_only=True)
+class DefinitionWriter:
+    """Writes the definition of a network whose neutral simulation gives back the flows of a table.
+
+    Flows from sources and stores are series; what passes through a process without stock is shared out as it was.
+    Where nothing passed, the shares are those of the nearest year with any, or of all regions together.
+    """
+
+    table: Annotated[FlowTable, "flows that balance"]
+    processes: Annotated[Processes, "its processes"]
+    roles: Annotated[Mapping[str, Role], "of sources, sinks and stores; others belong to the technosphere"]
+    stocks: Annotated[Mapping[tuple[str, str, int], float], "by region, process and year, at its end"]
+    name: Annotated[str, "of the network, and of the data file"]
+    title: Annotated[str, "in words"]
+    source: Annotated[str, "where the numbers come from"]
 
     def __post_init__(self) -> None:
-        table, processes = self._table, self._processes
+        """Name nodes, arcs and regions."""
+        table, processes = self.table, self.processes
         self._mass = table.unit.rpartition("/")[0]
         self._regional = table.regions != ("",)
         self._nodes = identifiers(processes.names)
@@ -125,17 +106,17 @@ class _Writer:
         self._arcs = {pair: names[texts[pair]] for pair in table.pairs}
         self._regions = identifiers(table.regions) if self._regional else {}
 
-    def definition(self) -> ImportedFiles:
+    def files(self) -> ImportedFiles:
         """Write everything."""
         lines = [*self._head(), *self._node_tables(), *self._arc_tables()]
         return ImportedFiles("\n".join(lines) + "\n", self._data(), self._of_regions(), self._arcs)
 
     def _head(self) -> Iterator[str]:
-        years, unit, source = self._table.years, self._table.unit, _text(self._source)
-        yield f"# {self._title}"
+        years, unit, source = self.table.years, self.table.unit, _text(self.source)
+        yield f"# {self.title}"
         yield "# Made by cirl import, and yours to change: `cirl check` names mistakes."
-        yield f"name = {_text(self._name)}"
-        yield f"title = {_text(self._title + (' of {region}' if self._regional else ''))}"
+        yield f"name = {_text(self.name)}"
+        yield f"title = {_text(self.title + (' of {region}' if self._regional else ''))}"
         yield 'material = "not stated"'
         yield f"references = [{source}]"
         yield from ("", "[units]", f"mass = {_text(self._mass)}", 'time = "year"')
@@ -157,20 +138,20 @@ class _Writer:
 
     def _references(self) -> list[tuple[float, float]]:
         """Return reference flow and stock of each region, to two digits."""
-        largest = self._processes.flows.max(axis=(1, 2))
+        largest = self.processes.flows.max(axis=(1, 2))
         return [
-            (_round_significant(flow), _round_significant(flow * len(self._table.years))) for flow in largest.tolist()
+            (_round_significant(flow), _round_significant(flow * len(self.table.years))) for flow in largest.tolist()
         ]
 
     def _of_regions(self) -> list[list[object]]:
         """Return what differs from region to region and not from year to year, a row for each."""
         if not self._regional:
             return []
-        stores = [process for process in self._processes.of(ProcessKind.STORE) if self._first_stocks(process)]
+        stores = [process for process in self.processes.of(ProcessKind.STORE) if self._first_stocks(process)]
         rows: list[list[object]] = [
             ["region", "flow", "stock", *(f"stock of {self._nodes[store]}" for store in stores)]
         ]
-        for region, scales in zip(self._table.regions, self._references(), strict=True):
+        for region, scales in zip(self.table.regions, self._references(), strict=True):
             rows.append([region, *scales, *(self._first_stocks(store)[region] for store in stores)])
         return rows
 
@@ -180,19 +161,19 @@ class _Writer:
         return f"{{ {self._of_region(column)}, unit = {_text(unit)}, source = {_text(source)} }}"
 
     def _of_region(self, column: str) -> str:
-        return f'file = "{self._name}_regions.csv", column = "{column}", where = {{ region = "{{region}}" }}'
+        return f'file = "{self.name}_regions.csv", column = "{column}", where = {{ region = "{{region}}" }}'
 
     def _node_tables(self) -> Iterator[str]:
         for process, id_ in self._nodes.items():
-            kind = self._processes.kinds[process]
+            kind = self.processes.kinds[process]
             yield from ("", f"[nodes.{id_}]")
             if id_ != process:
                 yield f"title = {_text(process)}"
-            yield f'role = "{self._roles.get(process, Role.TECHNOSPHERE).value}"'
+            yield f'role = "{self.roles.get(process, Role.TECHNOSPHERE).value}"'
             if kind is ProcessKind.TRANSIT:
                 yield "stores = false"
             elif kind is ProcessKind.SINK:
-                since = _text(f"counted from {self._table.years[0]}")
+                since = _text(f"counted from {self.table.years[0]}")
                 yield f"initial = {{ low = 0, high = 0, unit = {_text(self._mass)}, source = {since} }}"
             elif stock := self._initial(process):
                 yield stock
@@ -203,16 +184,16 @@ class _Writer:
         """Return the initial stock of a store, if it is known."""
         if not (stocks := self._first_stocks(process)):
             return ""
-        unit_and_source = f"unit = {_text(self._mass)}, source = {_text(self._source)}"
+        unit_and_source = f"unit = {_text(self._mass)}, source = {_text(self.source)}"
         if not self._regional:
             return f"initial = {{ low = {stocks['']!r}, high = {stocks['']!r}, {unit_and_source} }}"
         return f"initial = {{ {self._of_region(f'stock of {self._nodes[process]}')}, {unit_and_source} }}"
 
     def _first_stocks(self, process: str) -> dict[str, float]:
         """Return the stock at the end of the year before the first by region; nothing if one is not known."""
-        before = self._table.years[0] - 1
-        keys = {region: (region, process, before) for region in self._table.regions}
-        return {r: self._stocks[k] for r, k in keys.items()} if self._stocks.keys() >= {*keys.values()} else {}
+        before = self.table.years[0] - 1
+        keys = {region: (region, process, before) for region in self.table.regions}
+        return {r: self.stocks[k] for r, k in keys.items()} if self.stocks.keys() >= {*keys.values()} else {}
 
     def _arc_tables(self) -> Iterator[str]:
         for pair, id_ in self._arcs.items():
@@ -220,8 +201,8 @@ class _Writer:
             if pair.type:
                 yield f"title = {_text(pair.type)}"
             yield from (f'from = "{self._nodes[pair.source]}"', f'to = "{self._nodes[pair.target]}"')
-            if self._processes.kinds[pair.source] is not ProcessKind.TRANSIT:
-                yield from ('law = "exogenous"', f"flow = {self._column(id_, self._table.unit)}")
+            if self.processes.kinds[pair.source] is not ProcessKind.TRANSIT:
+                yield from ('law = "exogenous"', f"flow = {self._column(id_, self.table.unit)}")
             elif self._rest(pair):
                 yield from ('law = "share"', 'share = "rest"')
             else:
@@ -229,20 +210,20 @@ class _Writer:
 
     def _rest(self, pair: Connection) -> bool:
         """Whether the share of a pair is what the others leave: of the largest flow out of its process."""
-        total = self._processes.flows.sum(axis=(0, 1))
-        of = [k for k, arc in enumerate(self._table.pairs) if arc.source == pair.source]
-        return self._table.pairs[max(of, key=lambda k: total[k])] == pair
+        total = self.processes.flows.sum(axis=(0, 1))
+        of = [k for k, arc in enumerate(self.table.pairs) if arc.source == pair.source]
+        return self.table.pairs[max(of, key=lambda k: total[k])] == pair
 
     def _column(self, arc: str, unit: str) -> str:
         region = 'where = { region = "{region}" }, ' if self._regional else ""
-        place = f'file = "{self._name}.csv", column = "{arc}", {region}'
-        return f"{{ {place}unit = {_text(unit)}, source = {_text(self._source)} }}"
+        place = f'file = "{self.name}.csv", column = "{arc}", {region}'
+        return f"{{ {place}unit = {_text(unit)}, source = {_text(self.source)} }}"
 
     def _data(self) -> list[list[object]]:
         """Return header and rows of the data file, in the order of regions and years."""
-        table, flows = self._table, self._processes.flows
+        table, flows = self.table, self.processes.flows
         values = flows.copy()
-        for process in self._processes.of(ProcessKind.TRANSIT):
+        for process in self.processes.of(ProcessKind.TRANSIT):
             outflows = [k for k, pair in enumerate(table.pairs) if pair.source == process]
             values[:, :, outflows] = shares_of(flows[:, :, outflows])
         rows: list[list[object]] = [[*(["region"] if self._regional else []), "year", *self._arcs.values()]]

@@ -122,7 +122,7 @@ class Quantity(Declaration):
         return kinds if isinstance(kinds, str) else kinds.of.get(getattr(part, kinds.by), kinds.otherwise)
 
     def problem(self, value: object) -> str:
-        """See ``Declared.problem``."""
+        """See ``Declaration.problem``."""
         if self.past:
             return "" if isinstance(value, TimeDependent) else f"a series, of times and values, got {value!r}"
         return "" if self.varies and isinstance(value, TimeDependent) else _problem(value, "a number", ())
@@ -159,7 +159,7 @@ class Numbers(Declaration):
     varies: Annotated[bool, "whether it may change in time"] = False
 
     def problem(self, value: object) -> str:
-        """See ``Declared.problem``."""
+        """See ``Declaration.problem``."""
         return "" if self.varies and isinstance(value, TimeDependent) else _problem(value, self.form, self.shape)
 
 
@@ -172,7 +172,7 @@ class CalendarTime(Declaration):
     """A point in time on the calendar, which definition files spell as a number or a date."""
 
     def problem(self, value: object) -> str:
-        """See ``Declared.problem``."""
+        """See ``Declaration.problem``."""
         year: Any = value.year if isinstance(value, date) else value
         if isinstance(year, Real) and not isinstance(value, bool | datetime) and 1 <= float(year) < 9999:
             return ""

@@ -41,7 +41,7 @@ RESERVE = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class Network(Specification):
-    """A thermodynamical material network under one scenario; its attributes are those of ``Parts``."""
+    """A thermodynamical material network under one scenario; its attributes are those of ``Specification``."""
 
     def __post_init__(self) -> None:
         """Put nodes with a stock first; refuse a network that cannot be simulated, naming every fault."""

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import field, replace
 from itertools import pairwise
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -129,7 +129,7 @@ class Series(CheckedRecord, TimeDependent):
         within = edges - times[index]
         integral = total[index] + values[index] * within + slopes[index] * within**2 / 2
         # differences of a sum round: what holds throughout is its own mean, and no mean leaves the values it is of
-        begins, ends = self.begins(edges[:-1]), self.ends(edges[1:])
+        begins, ends = self.limits(edges[:-1], "right"), self.limits(edges[1:], "left")
         lowest, highest = np.minimum(begins, ends), np.maximum(begins, ends)
         of = np.searchsorted(edges, times, side="right") - 1
         inside = (of >= 0) & (of < len(lowest))
@@ -138,19 +138,12 @@ class Series(CheckedRecord, TimeDependent):
         means: Floats = np.clip(np.diff(integral) / np.diff(edges), lowest, highest)
         return means
 
-    def begins(self, times: Floats) -> Floats:
-        """Return the values from some times on, shape (times,)."""
+    def limits(self, times: Floats, side: Literal["left", "right"]) -> Floats:
+        """Return the values until some times (``left``), or from them on (``right``), shape (times,)."""
         points, values, slopes = self._lines()
-        index = np.maximum(np.searchsorted(points, times, side="right") - 1, 0)
-        starts: Floats = values[index] + slopes[index] * (times - points[index])
-        return starts
-
-    def ends(self, times: Floats) -> Floats:
-        """Return the values until some times, shape (times,)."""
-        points, values, slopes = self._lines()
-        index = np.maximum(np.searchsorted(points, times, side="left") - 1, 0)
-        stops: Floats = values[index] + slopes[index] * (times - points[index])
-        return stops
+        index = np.maximum(np.searchsorted(points, times, side=side) - 1, 0)
+        limits: Floats = values[index] + slopes[index] * (times - points[index])
+        return limits
 
     def _lines(self) -> tuple[Floats, Floats, Floats]:
         """Return times, values and slopes from each time on."""
@@ -165,10 +158,8 @@ class Series(CheckedRecord, TimeDependent):
         factors = [replace(self, factor=None), self.factor]
         instants = np.array([*self.times, *self.factor.times])
         points = np.union1d(edges, instants[(instants > edges[0]) & (instants < edges[-1])])
-        begins, ends = (
-            np.array([getattr(series, side)(at) for series in factors])
-            for side, at in (("begins", points[:-1]), ("ends", points[1:]))
-        )
+        begins = np.array([series.limits(points[:-1], "right") for series in factors])
+        ends = np.array([series.limits(points[1:], "left") for series in factors])
         middle = (begins + ends) / 2
         part = (begins.prod(axis=0) + 4 * middle.prod(axis=0) + ends.prod(axis=0)) / 6 * np.diff(points)
         first = np.searchsorted(points, edges[:-1])
