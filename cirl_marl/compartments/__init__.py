@@ -100,12 +100,8 @@ def model_class(kind: str) -> type[Any]:
 def kind_of(model: CompartmentModel) -> str:
     """Return the name by which definitions call the class of ``model``: its kind, or where it is if it is your own."""
     model_type, kind = type(model), model.kind
-    is_built_in = kind in _models_of(__name__) or kind in _models_of(ROBOTS)
-    return (
-        kind
-        if is_built_in and model_class(kind) is model_type
-        else f"{model_type.__module__}:{model_type.__qualname__}"
-    )
+    built_in = _models_of(__name__).get(kind) or _models_of(ROBOTS).get(kind)
+    return kind if built_in is model_type else f"{model_type.__module__}:{model_type.__qualname__}"
 
 
 def _elsewhere(place: str) -> type[Any]:

@@ -238,14 +238,11 @@ class Converter:
                     f"{path}.multiplied_by.multiplied_by: a quantity has one factor; multiply the others"
                 )
         unit = self._factor(name, kind, path)
-        value = self._in_time(quantity.value if isinstance(quantity, QuantityTable) else quantity, unit, path)
+        value = self._in_time(quantity, unit, path)
         self._spread(quantity, value, unit, path)
         if multiplier is None:
             return value
-        path = f"{path}.multiplied_by"
-        return product(
-            value, self._in_time(multiplier.value if isinstance(multiplier, QuantityTable) else multiplier, 1.0, path)
-        )
+        return product(value, self._in_time(multiplier, 1.0, f"{path}.multiplied_by"))
 
     def _spread(self, quantity: Any, value: Value, unit: float, path: str) -> None:
         """Note how a quantity spreads, if it does."""
@@ -270,8 +267,10 @@ class Converter:
         kind = quantity.distribution or ("uniform" if deviation is None else "normal")
         self.uncertain[path] = Spread(deviation=relative, low=low, high=high, distribution=kind)
 
-    def _in_time(self, entry: float | AmountSeries | AmountColumn, unit: float, path: str) -> Value:
+    def _in_time(self, entry: float | QuantityTable | AmountSeries | AmountColumn, unit: float, path: str) -> Value:
         """Return a number, or one that changes in time, in the network's units, of which its own is ``unit``."""
+        if isinstance(entry, QuantityTable):
+            return entry.value * unit
         if not isinstance(entry, AmountSeries | AmountColumn):
             return entry * unit
         try:

@@ -16,6 +16,8 @@ from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network.calendar import YearOrDate
 
 T = TypeVar("T")
+Line = tuple[int, list[str]]
+"""A row of a table, with the number of the line on which it ends."""
 LARGEST = 200_000_000
 """Bytes of the largest file that is read."""
 YEAR = "year"
@@ -29,6 +31,34 @@ class Column:
     times: Sequence[YearOrDate] | None
     values: Sequence[float]
     origin: str
+
+
+def csv_lines(subject: str, content: bytes) -> list[Line]:
+    """Return the lines of a CSV file that are not empty."""
+    try:
+        reader = csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
+        # csv counts the line on which a row ends
+        return [(reader.line_num, row) for row in reader if row]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise CirlError(f"{subject}: is no CSV file in UTF-8: {error}") from error
+
+
+def even_lines(subject: str, lines: list[Line]) -> list[Line]:
+    """Return the lines of a table; a ``CirlError`` if there are none, or if one is not as long as the first."""
+    if not lines:
+        raise CirlError(f"{subject}: is empty; its first line names the columns")
+    for line, row in lines:
+        if len(row) != len(lines[0][1]):
+            raise CirlError(f"{subject}, line {line}: {len(row)} cells in {len(lines[0][1])} columns")
+    return lines
+
+
+def number_in(text: str) -> float:
+    """Return the number that a cell says, NaN if it says none."""
+    try:
+        return float(text.replace("_", "?"))
+    except ValueError:
+        return math.nan
 
 
 class DataFiles:
@@ -113,22 +143,11 @@ class _Table:
 
     def __init__(self, name: str, content: bytes) -> None:
         self.name, self.sha256 = name, hashlib.sha256(content).hexdigest()
-        try:
-            reader = csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
-            # csv counts the line on which a row ends
-            lines = [(reader.line_num, row) for row in reader if row]
-        except (UnicodeDecodeError, csv.Error) as error:
-            raise CirlError(f"file '{name}': is no CSV file in UTF-8: {error}") from error
-        if not lines:
-            raise CirlError(f"file '{name}': is empty; its first line names the columns")
-        (_, self.header), *self.rows = lines
+        (_, self.header), *self.rows = even_lines(f"file '{name}'", csv_lines(f"file '{name}'", content))
         self.place = {column: i for i, column in enumerate(self.header)}
         if len(self.place) != len(self.header):
             twice = next(name_ for name_ in self.header if self.header.count(name_) > 1)
             raise CirlError(f"file '{name}', line 1: names the column '{twice}' twice")
-        for line, row in self.rows:
-            if len(row) != len(self.header):
-                raise CirlError(f"file '{name}', line {line}: {len(row)} cells in {len(self.header)} columns")
         self._indices: dict[tuple[int, ...], dict[tuple[str, ...], list[int]]] = {}
 
     def column(self, column: str, conditions: Mapping[str, str], times: str | None) -> Column:
@@ -175,10 +194,7 @@ class _Table:
 
     def _number(self, line: int, row: Sequence[str], column: str) -> float:
         text = row[self.place[column]]
-        try:
-            value = float(text.replace("_", "?"))
-        except ValueError:
-            value = math.nan
+        value = number_in(text)
         if not math.isfinite(value):
             remedy = "is no number; write one as in 1234.5" if text.strip() else "is empty; write a number, or 0"
             raise CirlError(f"file '{self.name}', line {line}, column '{column}': '{text}' {remedy}")

@@ -167,11 +167,8 @@ class ArcRates:
         if sparse := 2 * len(self._controlled_arcs) < len(base):
             rate = np.empty((len(base), controls.shape[1]))
             rate[...] = base
-            own_row, base, donor = (
-                own_row[self._controlled_arcs],
-                base[self._controlled_arcs],
-                donor[self._controlled_arcs],
-            )
+            own_row, donor = own_row[self._controlled_arcs], donor[self._controlled_arcs]
+            base = base[self._controlled_arcs]
         rate_: Floats = controls.take(own_row, axis=0)
         rate_ *= base
         rate_ *= controls.take(donor, axis=0)

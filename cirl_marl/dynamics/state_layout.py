@@ -72,10 +72,8 @@ class StateLayout:
         stages_of: Mapping[str, tuple[str, ...]] = {}
         self.stages: dict[int, Integers] = {}
         if isinstance(network, StagedNetwork):
-            stages_of, index = (
-                {n: names_ for n, names_ in network.stages.items() if len(names_) > 1},
-                network.node_index,
-            )
+            stages_of = {node: stages for node, stages in network.stages.items() if len(stages) > 1}
+            index = network.node_index
             self.stages = {index[node]: network.node_index_of(stages) for node, stages in stages_of.items()}
         self._totals = _totals(nodes, self.stages) if stages_of else None
         names: list[str] = []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Annotated
 from zipfile import BadZipFile
 
+from cirl_marl.definitions.data_files import Line, csv_lines, even_lines, number_in
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.units import factor
@@ -86,7 +86,7 @@ class _Grid:
 
     name: str
     header: list[str]
-    rows: list[tuple[int, list[str]]]
+    rows: list[Line]
     places: dict[str, int] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -111,10 +111,7 @@ class _Grid:
             CirlError: naming file, line, column and text, if it is none or below ``least``.
         """
         label = f"{self.name}, line {line}, column '{column}'"
-        try:
-            value = float(text.replace("_", "?"))
-        except ValueError:
-            value = math.nan
+        value = number_in(text)
         if not math.isfinite(value):
             raise CirlError(f"{label}: '{text}' is no number; write one as in 1234.5, or leave out the row")
         if value < least:
@@ -302,12 +299,10 @@ def _grids(path: Path, sheet: str | None) -> Iterator[_Grid]:
     if sheet is not None:
         raise CirlError(f"{path}: is no workbook, so that it has no sheet '{sheet}'")
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.reader(file, strict=True)
-            lines = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise CirlError(f"{path}: is no CSV file in UTF-8: {error}") from error
-    yield _grid(path.name, lines)
+        content = path.read_bytes()
+    except OSError as error:
+        raise CirlError(f"{path}: cannot be read: {error}") from error
+    yield _grid(path.name, csv_lines(str(path), content))
 
 
 def _sheets(path: Path, sheet: str | None) -> Iterator[_Grid]:
@@ -327,19 +322,15 @@ def _sheets(path: Path, sheet: str | None) -> Iterator[_Grid]:
         for name in [sheet] if sheet is not None else years or book.sheetnames[:1]:
             rows = enumerate(book[name].iter_rows(values_only=True), start=1)
             texts = [(line, ["" if cell is None else str(cell) for cell in row]) for line, row in rows]
-            yield _grid(f"{path.name}, sheet '{name}'", [row for row in texts if any(text.strip() for text in row[1])])
+            yield _grid(f"{path.name}, sheet '{name}'", texts)
     finally:
         book.close()
 
 
-def _grid(name: str, lines: Sequence[tuple[int, list[str]]]) -> _Grid:
-    if not lines:
-        raise CirlError(f"{name}: is empty; its first line names the columns")
-    (_, header), *rows = lines
-    for line, row in rows:
-        if len(row) != len(header):
-            raise CirlError(f"{name}, line {line}: {len(row)} cells in {len(header)} columns")
-    return _Grid(name, header, list(rows))
+def _grid(name: str, lines: Sequence[Line]) -> _Grid:
+    """Return the table of a file or a sheet, without lines of blanks."""
+    (_, header), *rows = even_lines(name, [line for line in lines if any(cell.strip() for cell in line[1])])
+    return _Grid(name, header, rows)
 
 
 def _is_year(text: str) -> bool:

@@ -125,21 +125,21 @@ def splits(network: Specification) -> list[Split]:
             sides: list[list[Any]] = [[getattr(c, side) for c in controls] for side in ("low", "neutral", "high")]
             shares: list[Any] = [np.nan if share is None else share for _, share in free]
             values = [*(value for side in sides for value in side), *shares]
-            columns, bounds, numbers = 1, sides, shares
+            columns = 1
             if any(isinstance(value, Series) for value in values):
                 columns = horizon
-                bounds = [list(map(network.interval_means, side)) for side in sides]
-                numbers = [network.interval_means(share) for share in shares]
+                sides = [list(map(network.interval_means, side)) for side in sides]
+                shares = list(map(network.interval_means, shares))
             divisions.append(
                 Split(
                     donor=node.id,
                     controlled_arcs=tuple(k for k, arc in exits if arc.control is not None),
                     other_arcs=tuple(k for k, _ in free),
                     bounds=np.broadcast_to(
-                        np.array(bounds, dtype=float).reshape(3, -1, columns), (3, len(controls), horizon)
+                        np.array(sides, dtype=float).reshape(3, -1, columns), (3, len(controls), horizon)
                     ),
                     stated_shares=np.broadcast_to(
-                        np.array(numbers, dtype=float).reshape(-1, columns), (len(free), horizon)
+                        np.array(shares, dtype=float).reshape(-1, columns), (len(free), horizon)
                     ),
                 )
             )

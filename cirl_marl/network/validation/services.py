@@ -137,13 +137,7 @@ def _reach_problems(stockless_exits: Mapping[str, Sequence[Arc]], arc: Arc, serv
             new = {exit_.recipient for exit_ in out} - nodes
             nodes |= new
             queue += sorted(new)
-    within_reach = (
-        flows
-        if service.quantity == "flow"
-        else nodes
-        if service.quantity == "stock"
-        else nodes & stockless_exits.keys()
-    )
+    within_reach = {"flow": flows, "stock": nodes}.get(service.quantity, nodes & stockless_exits.keys())
     if within_reach.isdisjoint(service.providers):
         between = "only nodes that store nothing may lie between them"
         yield f"{subject}: what it carries does not reach '{service.provider}' at once; {between}"
