@@ -208,8 +208,8 @@ class IntervalRanges:
         self.followers = np.concatenate([np.zeros(0, dtype=np.intp), *(split.followers for split in self.free_splits)])
         # shares of a release do not leave one by one: the release as a whole does
         single = self.rate * ((self.driver == network.donors) & ~self.share_arcs)
-        leaving = [np.bincount(network.donors, bound, len(network.nodes)) for bound in single]
-        self.exits = np.array(leaving, dtype=float) + self.release
+        outflow = [np.bincount(network.donors, bound, len(network.nodes)) for bound in single]
+        self.exits = np.array(outflow, dtype=float) + self.release
 
 
 def share_ranges(split: Split, wishes: Floats) -> Floats:

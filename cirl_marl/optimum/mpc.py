@@ -204,8 +204,10 @@ class MPC(Planner):
         if last is not None and last.optimum is not None and window.start in last.intervals:
             problem, solution = last.optimum
             done = window.start - last.intervals.start + self._replan
-            decided = solution.plan.reshape(len(last.intervals), -1)[:done]
-            return replace(last, actions=normalised_actions(self._admissible, problem.layout, decided, last.intervals))
+            variables = solution.plan.reshape(len(last.intervals), -1)[:done]
+            return replace(
+                last, actions=normalised_actions(self._admissible, problem.layout, variables, last.intervals)
+            )
         neutral = np.concatenate([action[copy] for action in self._env.neutral_action.values()])
         return _Plan(int(self._env.episodes[copy]), window, None, np.tile(neutral, (self._replan, 1)), 1.0)
 
@@ -247,8 +249,8 @@ class MPC(Planner):
             except Infeasible:
                 if demand is None or programs is self._urgent:
                     raise
-        decided = solution.plan.reshape(len(intervals), -1)[: self._replan]
-        actions = normalised_actions(self._admissible, problem.layout, decided, intervals)
+        variables = solution.plan.reshape(len(intervals), -1)[: self._replan]
+        actions = normalised_actions(self._admissible, problem.layout, variables, intervals)
         return _Plan(int(env.episodes[copy]), intervals, (problem, solution), actions, unit)
 
 
