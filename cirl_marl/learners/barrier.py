@@ -15,8 +15,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,71 +28,56 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from cirl_marl.errors import RunError
 from cirl_marl.learners.agent_env import AgentVecEnv, StepResult
+from cirl_marl.network.declarations import with_field_docs
 
 LoggedStep = tuple[NDArray[np.float32], StepResult]
 """An action, and what the environment answered."""
 
 
+@with_field_docs
+@dataclass(slots=True, eq=False)
 class CheckpointBarrier:
-    """The barrier of one learner.
+    """The barrier of one learner."""
 
-    Attributes:
-        write: writes the state to a folder, with what else belongs to it; None if the run is kept nowhere.
-        folder: where a checkpoint is requested; None if none is.
-        log: steps since the learner wrote its state for that checkpoint; None if it has not.
-        replay_log: steps that a resumed learner has still to repeat.
-    """
-
-    def __init__(self, agent_env: AgentVecEnv) -> None:
-        """Of the learner in ``agent_env``."""
-        self._agent_env = agent_env
-        self.write: Callable[[Path, dict[str, Any]], None] | None = None
-        self._load: Callable[[], None] | None = None
-        self._acting_state: Mapping[str, Any] | None = None
-        self.folder: Path | None = None
-        self.log: list[LoggedStep] | None = None
-        self.replay_log: list[LoggedStep] = []
-
-    def resume_from(self, load: Callable[[], None], step: StepResult, acting_state: Mapping[str, Any] | None) -> None:
-        """Have ``load`` bring the learner into its saved state at the first barrier, where ``step`` was its last."""
-
-        def load_at_barrier() -> None:
-            self._agent_env.last_step = step
-            load()
-
-        self._load, self._acting_state = load_at_barrier, acting_state
+    agent_env: Annotated[AgentVecEnv, "its environment"]
+    write: Annotated[Callable[[Path, dict[str, Any]], None] | None, "writes its state and more to a folder"] = None
+    load: Annotated[Callable[[], None] | None, "brings a resumed learner into its state at the first barrier"] = None
+    loaded_acting_state: Annotated[Mapping[str, Any] | None, "saved memory of a policy that had learnt enough"] = None
+    folder: Annotated[Path | None, "where a checkpoint is requested; None if none is"] = None
+    log: Annotated[list[LoggedStep] | None, "steps since the state was written for that; None if it was not"] = None
+    replay_log: Annotated[list[LoggedStep], "what a resumed learner has still to repeat"] = field(default_factory=list)
 
     @property
     def is_restoring(self) -> bool:
         """Whether a resumed learner has not come to its first barrier yet."""
-        return self._load is not None
+        return self.load is not None
 
     @property
     def acting_state(self) -> Mapping[str, Any] | None:
         """The saved memory of a policy whose learner had finished; None if the learner goes on learning."""
-        return self._acting_state if self.is_restoring else None
+        return self.loaded_acting_state if self.is_restoring else None
 
     def arrive(self, acting_state: Mapping[str, Any] | None = None) -> None:
         """Load the state to resume from, or write it if requested; ``acting_state`` is that of a finished learner."""
-        if self._load is not None:
-            load, self._load = self._load, None
+        if self.load is not None:
+            load, self.load = self.load, None
             load()
         if self.folder is not None and self.log is None and self.write is not None:
             self.log = []
-            self.write(self.folder, {"handed": self._agent_env.last_step.state_dict(), "acting": acting_state})
+            self.write(self.folder, {"handed": self.agent_env.last_step.state_dict(), "acting": acting_state})
 
     def record(self) -> None:
         """Log the last step, if the learner has written its state."""
         if self.log is not None:
-            assert self._agent_env.action is not None
-            self.log.append((self._agent_env.action.copy(), self._agent_env.last_step))
+            assert self.agent_env.action is not None
+            self.log.append((self.agent_env.action.copy(), self.agent_env.last_step))
 
     def replay_step(self, place: int) -> None:
         """Answer from the replay log; a ``RunError`` if the learner's action is not the logged one."""
         action, step = self.replay_log[place]
-        if self._agent_env.action is None or not np.array_equal(action, self._agent_env.action):
-            raise RunError(f"{self._agent_env.title} does not do again what it did: versions or files are others now")
-        self._agent_env.last_step = step
+        if self.agent_env.action is None or not np.array_equal(action, self.agent_env.action):
+            raise RunError(f"{self.agent_env.title} does not do again what it did: versions or files are others now")
+        self.agent_env.last_step = step
 
     def release(self) -> None:
         """End the request, and with it the log."""

@@ -156,6 +156,11 @@ class Learner:
                 self._set(state)
                 self.streams.load_state_dict(state["streams"], active=not self.was_in_stack)
 
+        def load_at_barrier() -> None:
+            self.agent_env.last_step = last_step
+            if not self.was_in_stack:
+                load()
+
         with self._errors_name_file(folder):
             self.was_in_stack = state["stacked"]
             self._first_timestep = state["model"]["values"]["_num_timesteps_at_start"]
@@ -163,8 +168,8 @@ class Learner:
             self.barrier.replay_log = [(action, StepResult.from_state(step)) for action, step in log]
             if self.was_in_stack:
                 load()
-            at_barrier = (lambda: None) if self.was_in_stack else load
-            self.barrier.resume_from(at_barrier, StepResult.from_state(state["handed"]), state["acting"])
+            last_step = StepResult.from_state(state["handed"])
+            self.barrier.load, self.barrier.loaded_acting_state = load_at_barrier, state["acting"]
         return self
 
     @contextmanager

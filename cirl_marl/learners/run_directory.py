@@ -47,15 +47,7 @@ from cirl_marl.records.machine import versions
 STATES = ("running", "complete", "interrupted", "failed")
 CHECKPOINT = re.compile(r"\d{9,}-(start|running|interrupted|complete|best|failed)")
 """Names of checkpoints."""
-FILES_BEFORE_CONFIG = {
-    "network",
-    "network.toml",
-    "versions.json",
-    ".versions.partial.json",
-    "status.json",
-    ".status.partial.json",
-}
-FILES_BEFORE_CONFIG |= {".config.partial.json", ".lock"}
+BEFORE_CONFIG = re.compile(r"network(\.toml)?|(versions|status)\.json|\.(versions|status|config)\.partial\.json|\.lock")
 """What is in the directory of a run before its description is."""
 PARTIAL = "next.partial"
 """Folder of a checkpoint that is being written."""
@@ -145,7 +137,7 @@ class RunDirectory:
         if self.path.is_symlink() or not self.path.is_dir():
             return False
         names = {entry.name for entry in self.path.iterdir()}
-        return "versions.json" in names and names <= FILES_BEFORE_CONFIG
+        return "versions.json" in names and all(map(BEFORE_CONFIG.fullmatch, names))
 
     @contextmanager
     def lock(self) -> Iterator[None]:

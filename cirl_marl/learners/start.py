@@ -30,8 +30,8 @@ NAMES_LISTED = 3
 Bounds = tuple[float, float]
 
 
-def begin_from(start: Start, learner: Learner, env: MultiAgentVectorEnv, seed: int) -> Origin:
-    """Give a fresh ``learner`` in ``env`` the policy that ``start`` names; return where it comes from.
+def begin_from(learner: Learner, start: Start, env: MultiAgentVectorEnv, seed: int) -> Origin:
+    """Give a fresh ``learner`` in ``env`` the policy that its ``start`` names; return where it comes from.
 
     In the name of the run ``{seed}`` stands for ``seed``, so that one recipe serves several seeds.
 

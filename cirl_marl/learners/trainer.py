@@ -104,12 +104,13 @@ class Training:
                     self.learners[name] = learner.load(checkpoint)
                 else:
                     self.learners[name] = learner.restore(checkpoint)
+        starts = [(learner, learner.spec.start) for learner in self.learners.values() if learner.spec.start is not None]
         if checkpoint is None:
-            self._begin_from_others()
+            origins = {learner.name: begin_from(learner, start, env, config.seed) for learner, start in starts}
+            self.config = config.model_copy(update={"origins": origins})
         elif checkpoint.name.endswith("-start"):
-            for learner in self.learners.values():
-                if learner.spec.start is not None:
-                    begin_again(checkpoint, learner)
+            for learner, _ in starts:
+                begin_again(checkpoint, learner)
         if self._saved_state is not None:
             self.world.load_state_dict(self._saved_state["world"])
         self._multiplier = self._service_multiplier(checkpoint)
@@ -141,16 +142,6 @@ class Training:
         if checkpoint is not None:
             multiplier.load(checkpoint)
         return multiplier
-
-    def _begin_from_others(self) -> None:
-        """Give learners their starts, and say in the configuration from where."""
-        starts = {name: learner.spec.start for name, learner in self.learners.items()}
-        origins = {
-            name: begin_from(start, self.learners[name], self.env, self.config.seed)
-            for name, start in starts.items()
-            if start is not None
-        }
-        self.config = self.config.model_copy(update={"origins": origins})
 
     def keep_in(self, run: RunDirectory) -> None:
         """Keep metrics, logs, checkpoints and the best of them in ``run`` from now on."""
