@@ -225,23 +225,16 @@ class Group:
 
 
 class Recipe(Settings):
-    """A learner for each agent of a network.
+    """A learner for each agent of a network."""
 
-    Attributes:
-        name: name in the catalogue.
-        title: one line for tables.
-        run: defaults of a training run.
-        environment: options of ``vector_env``, such as ``reward`` and ``observe``.
-        learner: the learner of agents that no match names.
-        match: learners of some agents.
-    """
-
-    name: str
-    title: str
-    run: Run = Run()
-    environment: Annotated[dict[str, Any], WithJsonSchema(Options.model_json_schema())] = {}
-    learner: LearnerSettings
-    match: list[Match] = []
+    name: str = Field(description="name in the catalogue")
+    title: str = Field(description="one line for tables")
+    run: Run = Field(Run(), description="defaults of a training run")
+    environment: Annotated[dict[str, Any], WithJsonSchema(Options.model_json_schema())] = Field(
+        {}, description="options of ``vector_env``, such as ``reward`` and ``observe``"
+    )
+    learner: LearnerSettings = Field(description="the learner of agents that no match names")
+    match: list[Match] = Field([], description="learners of some agents")
 
     @field_validator("match", mode="before")
     @classmethod

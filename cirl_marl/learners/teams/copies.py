@@ -162,13 +162,11 @@ class Copies:
             observation = observations[native]
             _put(self._observations[name], i, observation, self.observation_spaces[name], self._label(i, name))
             self.present[name][i] = True
-            self._mask(i, name, observation, infos.get(native) or {})
-
-    def _mask(self, i: int, name: str, observation: Any, info: Mapping[str, Any]) -> None:
-        mask = observation[MASK] if isinstance(observation, Mapping) and MASK in observation else info.get(MASK)
-        if mask is not None:
-            flat = np.asarray(mask, dtype=np.int8).ravel()
-            self.masks.setdefault(name, np.ones((self.num_envs, flat.size), dtype=np.int8))[i] = flat
+            has_mask = isinstance(observation, Mapping) and MASK in observation
+            mask = observation[MASK] if has_mask else (infos.get(native) or {}).get(MASK)
+            if mask is not None:
+                flat = np.asarray(mask, dtype=np.int8).ravel()
+                self.masks.setdefault(name, np.ones((self.num_envs, flat.size), dtype=np.int8))[i] = flat
 
     def _label(self, i: int, name: str) -> str:
         return f"copy {i} of the environment: agent '{name}'"
@@ -181,26 +179,16 @@ class AgentInCopy:
     """
 
     def __init__(self, copies: Copies, index: int, agent: str) -> None:
-        """View copy ``index`` as ``agent``."""
-        self.index, self.agent, self._copies = index, agent, copies
-
-    @property
-    def env(self) -> Any:
-        """The copy, a PettingZoo ``ParallelEnv``."""
-        return self._copies.envs[self.index]
-
-    @property
-    def render_mode(self) -> str | None:
-        """How the copy is drawn."""
-        mode: str | None = getattr(self.env, "render_mode", None)
-        return mode
+        """View copy ``index``, whose ``env`` is a PettingZoo ``ParallelEnv``, as ``agent``."""
+        self.index, self.agent, self.env, self._masks = index, agent, copies.envs[index], copies.masks
+        self.render_mode: str | None = getattr(self.env, "render_mode", None)
 
     @property
     def action_masks(self) -> Callable[[], NDArray[np.int8]]:
         """Returns which actions are legal now, for ``MaskablePPO``; there is no such attribute if all always are."""
-        if self.agent not in self._copies.masks:
+        if self.agent not in self._masks:
             raise AttributeError(f"agent '{self.agent}' has no {MASK} in its observations or infos")
-        return lambda: self._copies.masks[self.agent][self.index]
+        return lambda: self._masks[self.agent][self.index]
 
     def __getattr__(self, name: str) -> Any:
         """Fall back on the copy."""

@@ -284,12 +284,8 @@ def _settings(agent: str, algorithm: Algorithm, space: spaces.Space[Any], normal
         )
     if fixed_names := sorted(set(parameters) & set(RESERVED_PARAMETERS)):
         raise RecipeError(f"agent '{agent}': {name}: {', '.join(fixed_names)}: the team sees to that")
-    policy = policy_names[0] if policy_names else _policy_for(space, classes[name])
+    prefix = "MultiInput" if isinstance(space, spaces.Dict) else "Cnn" if is_image_space(space) else "Mlp"
+    policies = [alias for alias in classes[name].policy_aliases if alias.startswith(prefix)]
+    policy = [*policy_names, *policies, f"{prefix}Policy"][0]
     normalisation = Normalisation(observation=normalise, reward=normalise)
     return LearnerSettings(algorithm=name, policy=policy, parameters=parameters, normalise=normalisation)
-
-
-def _policy_for(space: spaces.Space[Any], kind: type[BaseAlgorithm]) -> str:
-    """Return the first policy of an algorithm for observations of a space."""
-    prefix = "MultiInput" if isinstance(space, spaces.Dict) else "Cnn" if is_image_space(space) else "Mlp"
-    return next((alias for alias in kind.policy_aliases if alias.startswith(prefix)), f"{prefix}Policy")
