@@ -25,7 +25,7 @@ from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, Str
 from cirl_marl.learners.policies import CentralCriticPolicy
 from cirl_marl.learners.recipe import LearnerSettings, Match, Normalisation, Recipe, Run, load_recipe
 from cirl_marl.learners.trainer import Training
-from cirl_marl.learners.views import AllAtOnce, OneAgent, SharedPolicy, View, unseen_state, view_of
+from cirl_marl.learners.views import AllAtOnce, OneAgent, SharedPolicy, View, unseen_state
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
@@ -70,7 +70,7 @@ def test_views_lose_nothing(network: Network, copies: int, seed: int) -> None:
     rewards = {agent: rng.normal(size=copies) for agent in env.agents}
     views: list[View] = [SharedPolicy(env, env.agents), AllAtOnce(env, env.agents)]
     views += [OneAgent(env, agent) for agent in env.agents]
-    for view in [*views, *(view_of(env, env.agents, scheme, with_state=True) for scheme in ("shared", "joint"))]:
+    for view in [*views, *(kind(env, env.agents).with_state(env) for kind in (SharedPolicy, AllAtOnce))]:
         rows = view.observe(observations, env.state)
         if isinstance(rows, dict):
             assert (rows["state"][:copies] == env.state()).all() and (rows["state"][-copies:] == env.state()).all()

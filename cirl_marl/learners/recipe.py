@@ -26,7 +26,7 @@ from cirl_marl.definitions.quantities import Number
 from cirl_marl.definitions.reader import read_toml
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import DefinitionError, RecipeError, unknown_name
-from cirl_marl.learners.views import CENTRAL_CRITIC, Scheme, View, view_of
+from cirl_marl.learners.views import CENTRAL_CRITIC, AllAtOnce, OneAgent, Scheme, SharedPolicy, View
 from cirl_marl.network import Network
 from cirl_marl.network.elements import Moment, Node, Observe, Reward, Role
 
@@ -221,7 +221,12 @@ class Group:
 
     def view(self, env: MultiAgentVectorEnv) -> View:
         """Return how the learner sees ``env``."""
-        return view_of(env, self.agents, self.spec.scheme, with_state=self.spec.policy == CENTRAL_CRITIC)
+        view: View
+        if self.spec.scheme == "independent":
+            view = OneAgent(env, *self.agents)
+        else:
+            view = (SharedPolicy if self.spec.scheme == "shared" else AllAtOnce)(env, self.agents)
+        return view.with_state(env) if self.spec.policy == CENTRAL_CRITIC else view
 
 
 class Recipe(Settings):

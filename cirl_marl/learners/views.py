@@ -219,17 +219,6 @@ class AllAtOnce(View):
         return mean
 
 
-def view_of(env: MultiAgentVectorEnv, agents: Sequence[str], scheme: Scheme, *, with_state: bool = False) -> View:
-    """Return how a learner of ``agents`` sees ``env``; one that is independent has a single agent."""
-    view: View
-    if scheme == "independent":
-        (agent,) = agents
-        view = OneAgent(env, agent)
-    else:
-        view = SharedPolicy(env, agents) if scheme == "shared" else AllAtOnce(env, agents)
-    return view.with_state(env) if with_state else view
-
-
 def unseen_state(env: MultiAgentVectorEnv) -> Callable[[], Floats]:
     """Return zeros in the place of the state, for acting: an actor does not look at it."""
     return lambda: np.zeros((env.num_envs, len(env.state_names) + 1))
