@@ -173,7 +173,7 @@ class Alone(AgentVecEnv):
     def __init__(self, env: MultiAgentVectorEnv, seeds: list[int]) -> None:
         """Seat the only agent of ``env``."""
         self.joint = env
-        super().__init__(env, env.agents[0], OneAgent(env, env.agents[0]), lambda: None)
+        super().__init__(env, env.agents[0], OneAgent(env, env.agents[0]))
         self.receive_reset(env.reset(seed=seeds), env.state)
 
     def step_wait(self) -> VecEnvStepReturn:
