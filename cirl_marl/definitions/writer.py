@@ -60,16 +60,16 @@ def _toml_tables(document: dict[str, Any]) -> tomlkit.TOMLDocument:
         if key in ("nodes", "arcs", "services") and value:
             layout[key] = tomlkit.table(is_super_table=True)
             for id_, part in value.items():
-                layout[key][id_] = _filled(tomlkit.table(), part)
+                layout[key][id_] = _fill_table(tomlkit.table(), part)
         else:
-            layout[key] = _filled(tomlkit.table(), value) if isinstance(value, dict) and value else value
+            layout[key] = _fill_table(tomlkit.table(), value) if isinstance(value, dict) and value else value
     return layout
 
 
-def _filled(table: Any, entries: dict[str, Any]) -> Any:
+def _fill_table(table: Any, entries: dict[str, Any]) -> Any:
     """Fill a TOML table; tables in it are inline."""
     for key, entry in entries.items():
-        table[key] = _filled(tomlkit.inline_table(), entry) if isinstance(entry, dict) else entry
+        table[key] = _fill_table(tomlkit.inline_table(), entry) if isinstance(entry, dict) else entry
     return table
 
 

@@ -61,13 +61,13 @@ class Shares:
             self._of, np.arange(len(controlled_exits)), 1.0, (len(varying_splits), len(controlled_exits))
         )
 
-        def stacked(tables: Iterable[Floats]) -> Floats:
+        def join_rows(tables: Iterable[Floats]) -> Floats:
             return np.concatenate([np.empty((0, columns)), *(table[:, :columns] for table in tables)])
 
-        self._low, neutral, high = (stacked(split.bounds[side] for split in varying_splits) for side in range(3))
+        self._low, neutral, high = (join_rows(split.bounds[side] for split in varying_splits) for side in range(3))
         self._room = np.maximum(1.0 - self._total(self._low), 0.0)
-        self._proportions = stacked(split.proportions for split in varying_splits)
-        stated_values = stacked(split.stated_shares for split in varying_splits)
+        self._proportions = join_rows(split.proportions for split in varying_splits)
+        stated_values = join_rows(split.stated_shares for split in varying_splits)
         self._rest, self._stated_shares = np.isnan(stated_values), np.where(np.isnan(stated_values), 0.0, stated_values)
         self._remainder = 1.0 - self._total(neutral)
         self._total_of_others = RowSum(

@@ -185,10 +185,10 @@ def _write(folder: Path, file: str, name: str, definition: ImportedFiles, change
         f"{name}_changes.csv": [[*header], *change_rows] if changes else [],
     }
     (folder / file).write_text(definition.text, encoding="utf-8")
-    written = {table: rows for table, rows in tables.items() if rows}
-    for table, rows in written.items():
+    non_empty = {table: rows for table, rows in tables.items() if rows}
+    for table, rows in non_empty.items():
         write_table(folder / table, list(map(str, rows[0])), rows[1:])
-    return [file, *written]
+    return [file, *non_empty]
 
 
 def _largest_error(path: Path, table: FlowTable, definition: ImportedFiles, progress: Callable[[float], None]) -> float:

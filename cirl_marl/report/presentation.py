@@ -131,8 +131,8 @@ Presenter = TypeVar("Presenter")
 
 def _of_its_kind(presenters: Mapping[type, Presenter], result: object, form: str) -> Presenter:
     """Return what presents a result; several simulations are a kind of their own, ``Sequence``."""
-    several = isinstance(result, Sequence) and result and all(isinstance(part, Simulation) for part in result)
-    kind = Sequence if several else type(result)
+    is_list = isinstance(result, Sequence) and result and all(isinstance(part, Simulation) for part in result)
+    kind = Sequence if is_list else type(result)
     if kind not in presenters:
         raise CirlError(f"there is no {form} of a {type(result).__name__}")
     return presenters[kind]
