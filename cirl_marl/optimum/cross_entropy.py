@@ -252,9 +252,7 @@ class _Best(NamedTuple):
         """Return the better of the two from each start, these if they are equal."""
         better = rival.objective > self.objective
         pairs = zip(rival, self, strict=True)
-        return _Best(
-            *(np.where(better.reshape(-1, *[1] * (best.ndim - 1)), candidate, best) for candidate, best in pairs)
-        )
+        return _Best(*(np.where(better.reshape(-1, *[1] * (pair[0].ndim - 1)), *pair) for pair in pairs))
 
 
 class Gaussians:

@@ -204,10 +204,8 @@ class MPC(Planner):
         if last is not None and last.optimum is not None and window.start in last.intervals:
             problem, solution = last.optimum
             done = window.start - last.intervals.start + self._replan
-            variables = solution.plan.reshape(len(last.intervals), -1)[:done]
-            return replace(
-                last, actions=normalised_actions(self._admissible, problem.layout, variables, last.intervals)
-            )
+            plan = solution.plan.reshape(len(last.intervals), -1)[:done]
+            return replace(last, actions=normalised_actions(self._admissible, problem.layout, plan, last.intervals))
         neutral = np.concatenate([action[copy] for action in self._env.neutral_action.values()])
         return _Plan(int(self._env.episodes[copy]), window, None, np.tile(neutral, (self._replan, 1)), 1.0)
 
