@@ -4,22 +4,11 @@ from __future__ import annotations
 
 import sys
 
-from cirl_marl.cli import comparing, demonstration, episodes, explaining, importing, learning, networks, sweeping
+from cirl_marl.cli import comparing, demonstration, episodes, explaining, importing, learning, networks, sweeping  # noqa: F401
 from cirl_marl.cli.common import app, errors, plain
 from cirl_marl.errors import CirlError, LearnerError
 
-__all__ = [
-    "app",
-    "comparing",
-    "demonstration",
-    "episodes",
-    "explaining",
-    "importing",
-    "learning",
-    "main",
-    "networks",
-    "sweeping",
-]
+__all__ = ["app", "main"]
 
 
 def main() -> None:
