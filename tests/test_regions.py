@@ -151,7 +151,10 @@ def test_commands_take_regions(
         assert f"{name}: 7 compartments, 0 agents, scenarios default, more: no mistakes" in printed
     list_networks()
     printed = capsys.readouterr().out
-    assert "ores_{japan, china}" in " ".join(printed.split())
+    assert "ores_* (2 regions)" in " ".join(printed.split())
+    list_networks(every_region=True)
+    printed = capsys.readouterr().out
+    assert "ores_japan" in printed and "ores_china" in printed
 
 
 def test_check_of_a_file_looks_at_every_region(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 
 from cirl_marl.cli import comparing, demonstration, episodes, explaining, importing, learning, networks, sweeping  # noqa: F401
@@ -13,6 +14,7 @@ __all__ = ["app", "main"]
 
 def main() -> None:
     """Run the command line; input that cannot be used ends it with exit code 2, a failed learner with 1."""
+    gc.set_threshold(200_000)  # most of what a command makes lasts: to look through it again and again takes long
     try:
         app()
     except (CirlError, OSError) as error:

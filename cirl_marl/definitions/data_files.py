@@ -62,7 +62,11 @@ def number_in(text: str) -> float:
 
 
 class DataFiles:
-    """The CSV files that one definition names, each read once."""
+    """The CSV files that one definition names, each read once.
+
+    Attributes:
+        read_values: what was made of their columns, by all that it depends on: scenarios read the same ones.
+    """
 
     def __init__(self, folder: Path) -> None:
         """Look for files in ``folder``, that of the definition, and below it."""
@@ -70,6 +74,7 @@ class DataFiles:
         self._tables: dict[str, _Table] = {}
         self._plain_files: dict[str, str] = {}
         self._stamps: dict[Path, int] = {}
+        self.read_values: dict[tuple[object, ...], Any] = {}
 
     @property
     def has_changed(self) -> bool:

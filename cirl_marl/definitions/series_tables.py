@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import date
+from functools import lru_cache
 
 from cirl_marl.definitions.data_files import DataFiles
 from cirl_marl.definitions.quantities import AmountColumn, AmountSeries
@@ -21,7 +22,7 @@ class Clock:
     start: YearOrDate | None
     unit: str
 
-    def times(self, moments: Sequence[YearOrDate], time_unit: str | None) -> tuple[float, ...]:
+    def times(self, moments: tuple[YearOrDate, ...], time_unit: str | None) -> tuple[float, ...]:
         """Return times since the start; given as such in ``time_unit``, or without it as years or dates."""
         if time_unit is not None:
             tick = factor(time_unit, self.unit)
@@ -32,16 +33,21 @@ class Clock:
         if self.start is None:
             remedy = "give a time_unit, in which times count from the start, or the start of the [episode]"
             raise CirlError(f"times are years or dates only if the episode has a start; {remedy}")
-        return tuple(elapsed_time(moment, self.start, self.unit) for moment in moments)
+        return _elapsed_times(moments, self.start, self.unit)
+
+
+@lru_cache(maxsize=1024)  # columns share their times
+def _elapsed_times(moments: tuple[YearOrDate, ...], start: YearOrDate, unit: str) -> tuple[float, ...]:
+    return tuple(elapsed_time(moment, start, unit) for moment in moments)
 
 
 def inline_series(table: AmountSeries, unit: float, clock: Clock) -> Series:
     """Return a series written in the definition; ``unit`` is that of its values."""
     return Series(
-        times=clock.times(table.times, table.time_unit),
+        times=clock.times(tuple(table.times), table.time_unit),
         values=tuple(value * unit for value in table.values),
         interpolation=table.interpolation,
-        until=None if table.until is None else clock.times([table.until], table.time_unit)[0],
+        until=None if table.until is None else clock.times((table.until,), table.time_unit)[0],
     )
 
 
@@ -52,11 +58,22 @@ def column_value(
 
     The last of several steps is known as long as the one before it holds; a single one for a year or a ``time_unit``.
     """
+    words = (table.file, table.column, table.times, table.time_unit, table.interpolation)
+    key = (*words, *conditions.items(), unit, clock)
+    if key not in files.read_values:
+        files.read_values[key] = _column_value(table, conditions, files, unit, clock)
+    value: Value = files.read_values[key]
+    return value
+
+
+def _column_value(
+    table: AmountColumn, conditions: Mapping[str, str], files: DataFiles, unit: float, clock: Clock
+) -> Value:
     column = files.column(table.file, table.column, conditions, table.times)
     values = tuple(value * unit for value in column.values)
     if column.times is None:
         return values[0]
-    times = clock.times(column.times, table.time_unit)
+    times = clock.times(tuple(column.times), table.time_unit)
     last = times[-1] - times[-2] if len(times) > 1 else factor(table.time_unit or "year", clock.unit)
     return Series(
         times=times,

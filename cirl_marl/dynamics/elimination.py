@@ -8,6 +8,7 @@ over all of them and all copies, so a column's bits do not depend on the batch i
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import cached_property, lru_cache
 from heapq import heapify, heappop, heappush
 from typing import Annotated
 
@@ -15,6 +16,10 @@ import numpy as np
 
 from cirl_marl.network import Floats, Integers, RowSum
 from cirl_marl.network.declarations import positional_record
+from cirl_marl.network.rowsum import Triangle, kernels_round_products
+
+_Link = tuple[int, int, int]
+"""Place of a pivot in its round, then what gives and what gets."""
 
 COSTLY = 2
 """A round eliminates nodes that are at most this many times as costly as the cheapest."""
@@ -45,7 +50,7 @@ class EliminationOrder:
     Attributes:
         nodes: number of nodes.
         size: number of entries.
-        rounds: what each round does.
+        pivots: the nodes that each round eliminates.
     """
 
     def __init__(self, nodes: int, pairs: Iterable[tuple[int, int]]) -> None:
@@ -56,18 +61,20 @@ class EliminationOrder:
         self._gets: list[set[int]] = [set() for _ in range(nodes)]
         for i, j in pairs:
             self._join(i, j)
-        self.rounds: list[_Round] = []
+        self.pivots: list[list[int]] = []
+        self._links: list[tuple[list[_Link], list[_Link], list[tuple[int, int, int]]]] = []
         candidates = set(range(nodes))
         while candidates:
             pivots = self._independent(candidates)
-            self.rounds.append(self._round_of(pivots))
+            self.pivots.append(pivots)
+            self._links.append(self._eliminate(pivots))
             candidates.difference_update(pivots)
 
     @property
     def work(self) -> tuple[int, int]:
         """Multiplications for every throughput, and for every elimination, in each copy."""
-        multiplications = sum(len(round_.out) + len(round_.into) for round_ in self.rounds)
-        return multiplications, sum(len(round_.first) for round_ in self.rounds)
+        multiplications = sum(len(out) + len(into) for out, into, _ in self._links)
+        return multiplications, sum(len(detours) for _, _, detours in self._links)
 
     def entry(self, i: int, j: int) -> int:
         """Return the entry of the share that i gives to j; the first ones are what leaves the set."""
@@ -94,37 +101,68 @@ class EliminationOrder:
                 near |= self._gives[i] | self._gets[i]
         return pivots
 
-    def _round_of(self, pivots: list[int]) -> _Round:
+    def _eliminate(self, pivots: list[int]) -> tuple[list[_Link], list[_Link], list[tuple[int, int, int]]]:
+        """Eliminate the nodes of a round: what they give, what they get, and each detour as way in, way out, entry."""
         out = [(n, i, k) for n, i in enumerate(pivots) for k in sorted(self._gives[i])]
         into = [(n, j, i) for n, i in enumerate(pivots) for j in sorted(self._gets[i])]
-        out_entries = [self.entry(i, k) for _, i, k in out]
-        into_entries = [self.entry(j, i) for _, j, i in into]
         ways: list[list[tuple[int, int]]] = [[(len(out) + n, -1)] for n in range(len(pivots))]
         for place, (n, _, k) in enumerate(out):
             ways[n].append((place, k))
-        detours = [(way_in, way_out, j, k) for way_in, (n, j, _) in enumerate(into) for way_out, k in ways[n] if k != j]
         for i in pivots:
             for k in self._gives[i]:
                 self._gets[k].discard(i)
             for j in self._gets[i]:
                 self._gives[j].discard(i)
-        entries = [self._join(j, k) for _, _, j, k in detours]
-        # entries that later rounds add are beyond those of now; the array of values has room for all of them
-        return _Round(
-            nodes=_places(pivots),
-            out=_places(out_entries),
-            giver=_places(n for n, _, _ in out),
-            out_sum=RowSum([n for n, _, _ in out], range(len(out)), 1.0, (len(pivots), len(out))),
-            into=_places(into_entries),
-            getter=_places(n for n, _, _ in into),
-            first=_places(way for way, _, _, _ in detours),
-            second=_places(way for _, way, _, _ in detours),
-            detours=RowSum(entries, range(len(entries)), 1.0, (self.size, len(entries))),
-            forward=RowSum([k for _, _, k in out], range(len(out)), 1.0, (self.nodes, len(out))),
-            donors=_places(i for _, i, _ in out),
-            backward=RowSum([i for _, _, i in into], range(len(into)), 1.0, (self.nodes, len(into))),
-            sources=_places(j for _, j, _ in into),
+        join = self._join
+        detours = [
+            (way_in, way_out, join(j, k)) for way_in, (n, j, _) in enumerate(into) for way_out, k in ways[n] if k != j
+        ]
+        return out, into, detours
+
+    @cached_property
+    def rounds(self) -> list[_Round]:
+        """What each round does; only of the order that is chosen it has to be known."""
+        return [self._round_of(pivots, *links) for pivots, links in zip(self.pivots, self._links, strict=True)]
+
+    @cached_property
+    def triangles(self) -> tuple[Integers, Triangle, Triangle]:
+        """All rounds in one: the nodes as they are eliminated, what they give on, and what comes back, in reverse."""
+        nodes = np.array([i for pivots in self.pivots for i in pivots], dtype=np.intp)
+        place = np.argsort(nodes)
+        out, into = (
+            place[np.array([link[1:] for links in self._links for link in links[n]], dtype=np.intp).reshape(-1, 2)]
+            for n in (0, 1)
         )
+        back = self.nodes - 1 - into
+        return nodes, Triangle(out[:, 1], out[:, 0], self.nodes), Triangle(back[:, 1], back[:, 0], self.nodes)
+
+    def _round_of(
+        self, pivots: list[int], out: list[_Link], into: list[_Link], detours: list[tuple[int, int, int]]
+    ) -> _Round:
+        givers, donors, receivers = np.array(out, dtype=np.intp).reshape(-1, 3).T.copy()
+        getters, sources, gets = np.array(into, dtype=np.intp).reshape(-1, 3).T.copy()
+        first, second, entries = np.array(detours, dtype=np.intp).reshape(-1, 3).T.copy()
+        return _Round(
+            nodes=np.array(pivots, dtype=np.intp),
+            out=np.array([self._place[i, k] for _, i, k in out], dtype=np.intp),
+            giver=givers,
+            out_sum=RowSum(givers, range(len(out)), 1.0, (len(pivots), len(out))),
+            into=np.array([self._place[j, i] for _, j, i in into], dtype=np.intp),
+            getter=getters,
+            first=first,
+            second=second,
+            detours=RowSum(entries, range(len(entries)), 1.0, (self.size, len(entries))),
+            forward=RowSum(receivers, range(len(out)), 1.0, (self.nodes, len(out))),
+            donors=donors,
+            backward=RowSum(gets, range(len(into)), 1.0, (self.nodes, len(into))),
+            sources=sources,
+        )
+
+
+@lru_cache(maxsize=16)  # scenarios of a network often differ in nothing that matters here
+def elimination_order(nodes: int, pairs: tuple[tuple[int, int], ...]) -> EliminationOrder:
+    """Return the order for the same nodes and pairs, found once."""
+    return EliminationOrder(nodes, pairs)
 
 
 class EliminatedShares:
@@ -146,20 +184,36 @@ class EliminatedShares:
             into *= inverse.take(round_.getter, 0)
             self._inverse[round_.nodes] = inverse
             self._steps.append((round_, out, into))
+        self._order = order
+
+    @cached_property
+    def _numbers(self) -> tuple[Floats, Floats, Floats]:
+        """What one copy gives on, the inverse pivots and what comes back, in the order of ``triangles``."""
+        nodes, ahead, back = self._order.triangles
+        out = np.concatenate([part[:, 0] for _, part, _ in self._steps])
+        into = np.concatenate([part[:, 0] for _, _, part in self._steps])
+        return ahead.arrange(out), self._inverse[nodes, 0], back.arrange(into)
 
     def throughput(self, inflow: Floats) -> Floats:
         """Return q in place of what enters from elsewhere, shape (nodes, B)."""
         # forward substitution in the order of elimination, then backward: (I − Pᵀ)⁻¹ = L⁻¹ D⁻¹ U⁻¹
+        if inflow.shape[1] == 1 and self._steps and kernels_round_products():
+            # of one copy each sum is that of many, but in two calls; a round takes longer to call than to compute
+            nodes, ahead, back = self._order.triangles
+            out, inverse, into = self._numbers
+            values = inflow[nodes, 0]
+            ahead.substitute(out, values)
+            values *= inverse
+            values = values[::-1].copy()
+            back.substitute(into, values)
+            inflow[nodes, 0] = values[::-1]
+            return inflow
         for round_, out, _ in self._steps:
             round_.forward.add_to(inflow, inflow.take(round_.donors, 0) * out)
         inflow *= self._inverse
         for round_, _, into in reversed(self._steps):
             round_.backward.add_to(inflow, inflow.take(round_.sources, 0) * into)
         return inflow
-
-
-def _places(numbers: Iterable[int]) -> Integers:
-    return np.array(list(numbers), dtype=np.intp)
 
 
 SparseRow = dict[int, float]
@@ -253,12 +307,12 @@ class StaticElimination:
         """Return what it costs to stop here, how many are eliminated then, who is kept, and in which order."""
         kept_nodes = sorted(self._gives)
         place = {i: n for n, i in enumerate(kept_nodes)}
-        pairs = [(place[i], place[j]) for i in kept_nodes for j in self._gives[i] if j in place and j != i]
-        order = EliminationOrder(len(kept_nodes), pairs)
+        pairs = ((place[i], place[j]) for i in kept_nodes for j in self._gives[i] if j in place and j != i)
+        order = elimination_order(len(kept_nodes), tuple(pairs))
         pass_cost, build_cost = order.work
         # factors that differ from copy to copy are gathered, multiplied and added: three passes over memory, not one
         return (
-            2 * entries + 3 * pass_cost + 4 * build_cost / SERIES + ROUND * len(order.rounds),
+            2 * entries + 3 * pass_cost + 4 * build_cost / SERIES + ROUND * len(order.pivots),
             len(self.order),
             kept_nodes,
             order,

@@ -20,7 +20,6 @@ from cirl_marl.dynamics.elimination import EliminatedShares, SparseRow, StaticEl
 from cirl_marl.dynamics.visit_bounds import VisitBounds
 from cirl_marl.network import Floats, Integers, Network, RowSum
 from cirl_marl.network.declarations import positional_record
-from cirl_marl.network.split_fractions import splits
 
 
 @positional_record
@@ -164,7 +163,7 @@ class Routing:
         Whatever the shares, what enters node j passes through nodes without stock at most v_j times in all
         (``passes``): no node sees more than that.
         """
-        passes = VisitBounds(self._network, splits(self._network))
+        passes = VisitBounds(self._network, self._network.splits)
         total = np.max([passes.total(step) for step in passes.kinds], axis=0)
         # every unit that enters node i passes through nodes at most total_i times
         inflow = self._inflow_sum(flow[:, None])[self.places, 0]

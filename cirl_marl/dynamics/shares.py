@@ -9,7 +9,6 @@ import numpy as np
 from cirl_marl.dynamics.uncertain_factors import RowFactors
 from cirl_marl.network import Floats, Integers, Network, RowSum
 from cirl_marl.network.rowsum import single_column
-from cirl_marl.network.split_fractions import splits
 from cirl_marl.network.uncertainty import numbers_of
 
 
@@ -30,7 +29,7 @@ class Shares:
         """Compile the splits of ``network``; with ``uncertain``, those of which a share is uncertain vary."""
         numbers = numbers_of(network, "arcs", "share") if uncertain else {}
         number_of = {network.arc_index[id_]: number for id_, number in numbers.items()}
-        all_splits = splits(network)
+        all_splits = network.splits
         tables = [(single_column(split.bounds), single_column(split.proportions)) for split in all_splits]
         self.is_time_varying = any(table.shape[-1] > 1 for pair in tables for table in pair)
         columns = network.episode.horizon if self.is_time_varying else 1

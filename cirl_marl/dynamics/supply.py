@@ -296,25 +296,26 @@ class Arrivals:
         ends = network.recipients[arcs] - stores
         self._stockless_ends: Integers = np.flatnonzero(ends >= 0)
         self._into: Integers = routing.places[ends[self._stockless_ends]]
+        into: dict[str, list[int]] = {}
+        for k, arc in enumerate(network.arcs):
+            into.setdefault(arc.recipient, []).append(k)
+        parts, stocks = getattr(network, "parts", {}), dict[str, set[str]]()
+        for node in network.stores:
+            stocks.setdefault(parts.get(node.id, node.id), set()).add(node.id)
         rows: list[int] = []
         columns: list[int] = []
         place = {int(k): n for n, k in enumerate([*routing.arcs, *arcs])}
         for row, service in enumerate(services):
             if service.quantity == "stock":
-                measured_arcs = self._inflows_of_stock(service)
+                stock = set[str]().union(*(stocks.get(id_, ()) for id_ in service.providers))
+                # what its parts hand on to each other is there already
+                measured_arcs = [k for id_ in stock for k in into.get(id_, ()) if network.arcs[k].donor not in stock]
             else:
                 measured_arcs = [int(k) for k in laws.staged_network.service_arcs(service)]
             columns_ = [place[k] for k in measured_arcs if k in place]
             rows += [row] * len(columns_)
             columns += columns_
         self._measure = RowSum(rows, columns, 1.0, (len(services), len(place)))
-
-    def _inflows_of_stock(self, service: Service) -> list[int]:
-        """Return the arcs that bring something to the stock that a service measures, from elsewhere."""
-        network = self._laws.staged_network
-        parts = getattr(network, "parts", {})
-        stock = {node.id for node in network.stores if parts.get(node.id, node.id) in service.providers}
-        return [k for k, arc in enumerate(network.arcs) if arc.recipient in stock and arc.donor not in stock]
 
     def __call__(self, rate: Floats, weights: Floats) -> Floats:
         """Return what each service measures more per supply to each, shape (services, services, B), per time.

@@ -10,6 +10,7 @@ import numpy as np
 from cirl_marl.network.elements import Lifetime, Node
 from cirl_marl.network.lifetimes import Chain
 from cirl_marl.network.rowsum import Floats
+from cirl_marl.network.series import Series
 
 STEEPEST = 100.0
 """Most by which the logarithm of what enters may grow in a lifetime."""
@@ -30,17 +31,25 @@ def remaining_history(node: Node, interval: float) -> Floats:
     """
     lifetime, history, growth = node.lifetime, node.history, node.growth
     assert lifetime is not None and history is not None
-    if (chain := lifetime.chain) is None:
+    if lifetime.chain is None:
         return np.append(past_inflows(node, interval, slots(lifetime, interval)), 0.0)
+    return _remaining_stages(lifetime, history, growth, interval)
+
+
+@lru_cache(maxsize=1024)  # a network asks several times, and its scenarios do
+def _remaining_stages(lifetime: Lifetime, history: Series, growth: float | None, interval: float) -> Floats:
+    chain = lifetime.chain
+    assert chain is not None
     edges = np.append(np.arange(history.times[0], -1e-9 * interval, interval), 0.0)
     stages = np.zeros(chain.stages)
     if growth is not None:
-        stages = chain.growing_stock(growth * lifetime.mean) * _first(node, interval) * lifetime.mean
+        stages = chain.growing_stock(growth * lifetime.mean) * _first(history, growth, interval) * lifetime.mean
     whole = propagator(chain, interval / lifetime.mean)
     for begin, end, inflow in zip(edges[:-1], edges[1:], history.means(edges), strict=True):
         shorter = end - begin < interval * (1 - 1e-9)
         transition, gain = propagator(chain, (end - begin) / lifetime.mean) if shorter else whole
         stages = transition @ stages + gain * inflow * lifetime.mean
+    stages.flags.writeable = False
     return stages
 
 
@@ -85,15 +94,14 @@ def past_inflows(node: Node, interval: float, count: int) -> Floats:
     """
     if node.history is None:
         return np.asarray(np.exp(-(node.growth or 0.0) * interval * np.arange(count)))
-    first = _first(node, interval)
+    first = _first(node.history, node.growth, interval)
     return np.array([_between(node, first, -interval * (i + 1), -interval * i) for i in range(count)])
 
 
-def _first(node: Node, interval: float) -> float:
+def _first(history: Series, growth: float | None, interval: float) -> float:
     """Return what flowed in when the history begins, as if what grew before had come to it."""
-    assert node.history is not None
-    begin, growth = node.history.times[0], node.growth or 0.0
-    first = float(node.history.means(np.array([begin, min(begin + interval, 0.0)]))[0])
+    begin, growth = history.times[0], growth or 0.0
+    first = float(history.means(np.array([begin, min(begin + interval, 0.0)]))[0])
     return first * growth * interval / float(np.expm1(growth * interval)) if growth else first
 
 

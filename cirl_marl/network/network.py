@@ -29,6 +29,7 @@ from cirl_marl.network.initial_ages import remaining_history
 from cirl_marl.network.rowsum import Floats, Integers, RowSum, spans
 from cirl_marl.network.series import Series
 from cirl_marl.network.specification import Specification
+from cirl_marl.network.split_fractions import Split, splits
 from cirl_marl.network.uncertainty import highest_factor
 from cirl_marl.network.validation import problems
 
@@ -173,6 +174,11 @@ class Network(Specification):
     def recipients(self) -> Integers:
         """Recipient node of each arc, shape (arcs,)."""
         return _read_only(np.array([self.node_index[arc.recipient] for arc in self.arcs], dtype=np.intp))
+
+    @cached_property
+    def splits(self) -> tuple[Split, ...]:
+        """How arcs of law ``share`` divide what leaves nodes, in the order of the nodes."""
+        return tuple(splits(self))
 
     @cached_property
     def controllable(self) -> tuple[str, ...]:

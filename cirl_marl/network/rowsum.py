@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from copy import copy
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -13,7 +14,7 @@ from scipy import sparse
 # The kernels behind scipy's ``csc_array @ dense``. For the small matrices here the operator spends most of its time on
 # dispatch and on a fresh result; the kernels add to an array that is already there. Columns of an incidence matrix have
 # two entries each, which suits processors better than rows of random length.
-from scipy.sparse._sparsetools import csc_matvec, csc_matvecs
+from scipy.sparse._sparsetools import csc_matvec, csc_matvecs, csr_matvec
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
@@ -39,6 +40,35 @@ def single_column(table: Floats) -> Floats:
 def disposable(stock: Floats, parts: int) -> Floats:
     """Return the mass that a stock can give away in so many parts without their rounding overdrawing it."""
     return np.where(stock > NEGLIGIBLE, stock * (1.0 - max(1e-12, 4.0 * np.finfo(float).eps * parts)), 0.0)
+
+
+class Triangle:
+    """Where the entries of a strictly lower triangular matrix stand, for one copy: its numbers are given in each use.
+
+    The rows are gone through in their order, and in a row the entries as they were given.
+    """
+
+    def __init__(self, rows: Integers, columns: Integers, size: int) -> None:
+        """Take the places of the entries."""
+        self._size, self._order = size, np.argsort(rows, kind="stable")
+        self._columns = columns[self._order]
+        self._starts: Integers = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=size))])
+
+    def arrange(self, numbers: Floats) -> Floats:
+        """Return the numbers of the entries, shape (entries,), as ``substitute`` takes them."""
+        return numbers.take(self._order)
+
+    def substitute(self, numbers: Floats, values: Floats) -> None:
+        """Replace ``values``, shape (rows,), by (I − W)⁻¹ values, as ``RowSum.substitute`` does."""
+        csr_matvec(self._size, self._size, self._starts, self._columns, numbers, values, values)
+
+
+@cache
+def kernels_round_products() -> bool:
+    """Whether the kernels round a product before they add it, as arrays do; on some processors they do not."""
+    factor, total = np.array([1.0 + 2.0**-30]), np.array([-(1.0 + 2.0**-29)])
+    csr_matvec(1, 1, np.array([0, 1]), np.array([0]), factor, factor, total)
+    return bool(total[0] == 0.0)
 
 
 class RowSum:

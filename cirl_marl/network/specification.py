@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -75,14 +75,26 @@ class Specification:
         """Return a value in each control interval, its mean over the interval, shape (horizon,)."""
         horizon = self.episode.horizon
         if not isinstance(value, Series):
-            return np.broadcast_to(np.float64(value), horizon)
+            return _constant(value, horizon)
         # many parts ask for the same series; the cache holds it, so that no other can get its id
         if id(value) not in self._series_means:
-            means = value.means(np.arange(horizon + 1, dtype=np.float64) * self.episode.control_interval)
-            means.flags.writeable = False
-            self._series_means[id(value)] = value, means
+            self._series_means[id(value)] = value, _means(value, horizon, self.episode.control_interval)
         return self._series_means[id(value)][1]
 
     @cached_property
     def _series_means(self) -> dict[int, tuple[Series, Floats]]:
         return {}
+
+
+def _constant(value: float, horizon: int) -> Floats:
+    """Return what ``np.broadcast_to`` does, which takes several times as long for one number."""
+    constant: Floats = np.ndarray(horizon, np.float64, np.array(value, dtype=np.float64), 0, (0,))
+    constant.flags.writeable = False
+    return constant
+
+
+@lru_cache(maxsize=4096)  # scenarios share most of their series
+def _means(series: Series, horizon: int, interval: float) -> Floats:
+    means = series.means(np.arange(horizon + 1, dtype=np.float64) * interval)
+    means.flags.writeable = False
+    return means

@@ -12,12 +12,14 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.network.declarations import positional_record
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.network.elements import Law
 from cirl_marl.network.rowsum import Floats, Integers, single_column
 from cirl_marl.network.series import Series
@@ -31,7 +33,8 @@ SUMS = 1e-6
 """Distance from 1 at which given shares count as summing to it; they are then scaled to do so."""
 
 
-@positional_record
+@with_field_docs
+@dataclass(frozen=True)
 class Split:
     """The arcs that share what leaves one node; where nothing changes its tables are views of one column."""
 
@@ -43,13 +46,13 @@ class Split:
         Floats, "share of each other arc under neutral control, NaN for the rest, shape (others, horizon)"
     ]
 
-    @property
+    @cached_property
     def proportions(self) -> Floats:
         """Return π of the other arcs, which sum to 1, shape (others, horizon)."""
         bounds, shares = single_column(self.bounds), single_column(self.stated_shares)
         return np.broadcast_to(proportions(shares, 1.0 - bounds[1].sum(axis=0)), self.stated_shares.shape)
 
-    @property
+    @cached_property
     def table(self) -> Floats:
         """Return what there is to know of each interval, one column if nothing changes, shape (numbers, intervals)."""
         bounds, proportions = single_column(self.bounds), single_column(self.proportions)

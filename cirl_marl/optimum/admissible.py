@@ -17,7 +17,7 @@ from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import positional_record, with_field_docs
 from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Node
-from cirl_marl.network.split_fractions import Split, splits
+from cirl_marl.network.split_fractions import Split
 from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.vintages import Lifetimes
 
@@ -104,7 +104,7 @@ class Admissible:
             compartment = _setter(network, arc)
             if compartment is not None:
                 setting[:, :, k] = _control_range(network, compartment, agents)
-        split_arcs = tuple(splits(network))
+        split_arcs = network.splits
         for split in split_arcs:
             arcs = [*split.controlled_arcs, *split.other_arcs]
             wishes = setting[:, :, list(split.controlled_arcs)].transpose(0, 2, 1)

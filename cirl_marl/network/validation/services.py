@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
@@ -127,17 +128,18 @@ def _reach_problems(stockless_exits: Mapping[str, Sequence[Arc]], arc: Arc, serv
     if service.quantity == "measure":
         yield f"{subject}: it asks for a measure of a model, which no flow makes up for at once"
         return
-    nodes, queue = {arc.recipient}, [arc.recipient]
-    flows = {arc.id}
-    while queue:
-        node = queue.pop()
-        if node in stockless_exits:
-            out = stockless_exits[node]
-            flows |= {exit_.id for exit_ in out}
-            new = {exit_.recipient for exit_ in out} - nodes
-            nodes |= new
-            queue += sorted(new)
-    within_reach = {"flow": flows, "stock": nodes}.get(service.quantity, nodes & stockless_exits.keys())
-    if within_reach.isdisjoint(service.providers):
+    providers = set(service.providers)
+    if service.quantity == "outflow":
+        providers &= stockless_exits.keys()
+    is_flow, nodes = service.quantity == "flow", {arc.recipient}
+    is_reached = arc.id in providers if is_flow else arc.recipient in providers
+    queue = deque(nodes)
+    while queue and not is_reached:
+        exits = stockless_exits.get(queue.popleft(), ())
+        new = {exit_.recipient for exit_ in exits} - nodes
+        is_reached = not providers.isdisjoint([exit_.id for exit_ in exits] if is_flow else new)
+        nodes |= new
+        queue += new
+    if not is_reached:
         between = "only nodes that store nothing may lie between them"
         yield f"{subject}: what it carries does not reach '{service.provider}' at once; {between}"
