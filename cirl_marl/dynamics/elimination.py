@@ -311,12 +311,8 @@ class StaticElimination:
         order = elimination_order(len(kept_nodes), tuple(pairs))
         pass_cost, build_cost = order.work
         # factors that differ from copy to copy are gathered, multiplied and added: three passes over memory, not one
-        return (
-            2 * entries + 3 * pass_cost + 4 * build_cost / SERIES + ROUND * len(order.pivots),
-            len(self.order),
-            kept_nodes,
-            order,
-        )
+        cost = 2 * entries + 3 * pass_cost + 4 * build_cost / SERIES + ROUND * len(order.pivots)
+        return cost, len(self.order), kept_nodes, order
 
     def _without(self, i: int) -> set[int]:
         """Eliminate node i and return its neighbours."""

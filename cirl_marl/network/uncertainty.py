@@ -172,13 +172,11 @@ def draw_network(network: Any, factors: Sequence[float]) -> Any:
     for node in network.stores:
         if node.initial is None and node.history is None:
             change(node, "initial", tuple(initial[node.id]))
-    groups = {
-        key: tuple(
-            replace(part_, **changes[id(part_)][1]) if id(part_) in changes else part_
-            for part_ in getattr(network, key)
-        )
-        for key in KINDS
-    }
+
+    def with_draws(part: Any) -> Any:
+        return replace(part, **changes[id(part)][1]) if id(part) in changes else part
+
+    groups = {key: tuple(map(with_draws, getattr(network, key))) for key in KINDS}
     return replace(network, **groups, uncertain={}, scenarios={})
 
 

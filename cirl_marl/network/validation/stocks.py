@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from cirl_marl.network.calendar import labels
-from cirl_marl.network.declarations import Quantity, bound_problems, declarations
+from cirl_marl.network.declarations import Quantity, bound_problems, declarations, default_of
 from cirl_marl.network.elements import (
     FIXED_LIFETIME,
     MAX_STEPS,
@@ -105,13 +105,9 @@ def lifetime_problems(network: Specification, node: Node, arcs: Sequence[Arc]) -
     """Yield what does not go with a lifetime that a node has or has not; ``arcs`` are those that enter or leave it."""
     prefix, kind = f"node '{node.id}': ", node.control.kind if node.control else None
     if node.lifetime is None:
-        states = {
-            "stretch": node.stretch != 1.0,
-            "history": node.history is not None,
-            "growth": node.growth is not None,
-        }
-        for name in (name for name, states_it in states.items() if states_it):
-            yield f"{prefix}{name}: it has no lifetime; give it one, or leave this out"
+        for name in ("stretch", "history", "growth"):
+            if getattr(node, name) != default_of(Node, name):
+                yield f"{prefix}{name}: it has no lifetime; give it one, or leave this out"
         if kind is ControlKind.STRETCH:
             yield f"{prefix}control.kind 'stretch' needs a lifetime; a valve is of kind 'rate'"
         return
