@@ -5,9 +5,29 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Sequence
 
+LONGEST_LINE = 1200
+"""Characters of a line of a message; of a longer one, which repeats what is in a file, the middle is left out."""
+
 
 class CirlError(ValueError):
     """Base of every error that this library raises about its input."""
+
+    def __init__(self, message: object = "") -> None:
+        """Take a message, lines of which that are too long to be read are shortened."""
+        super().__init__("\n".join(map(_shortened, str(message).split("\n"))))
+
+
+def _shortened(line: str) -> str:
+    """Return a line without its middle if it is too long.
+
+    >>> len(_shortened("x" * 100_000)) <= LONGEST_LINE
+    True
+    """
+    if len(line) <= LONGEST_LINE:
+        return line
+    cut = f" … ({len(line)} characters in all) … "
+    end = (LONGEST_LINE - len(cut)) // 2
+    return line[:end] + cut + line[-end:]
 
 
 class NetworkError(CirlError):

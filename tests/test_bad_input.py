@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from networkx import NetworkXError
+from numpy.typing import NDArray
 from small_networks import constant
 
 from cirl_marl import (
@@ -84,6 +86,7 @@ def test_acting_outside_an_episode() -> None:
         ({"scenario": "papr"}, "unknown scenario 'papr'. Did you mean 'paper'"),
         ({"num_envs": 0}, "num_envs.*0"),
         ({"horizon": 0}, "horizon must be a whole number of at least 1, got 0"),
+        ({"num_envs": 10**12}, "num_envs must be at most 16,777,216, got 1,000,000,000,000"),
     ],
 )
 def test_bad_options(options: dict[str, Any], message: str) -> None:
@@ -127,7 +130,9 @@ def test_bad_initial_state(given: Any, message: str) -> None:
     np.testing.assert_array_equal(env.state(), before)
 
 
-@pytest.mark.parametrize("seed", [-1, [1, 2, 3], [1, -1], 1.5, "one"])
+@pytest.mark.parametrize(
+    "seed", [-1, [1, 2, 3], [1, -1], 1.5, "one", True, [0, True], np.array(3), np.zeros((2, 1), int)]
+)
 def test_bad_seeds(seed: Any) -> None:
     """A seed is a non-negative integer, or one for each copy."""
     with pytest.raises(ControlError, match="seed"):
@@ -269,3 +274,46 @@ def test_misspelt_options_name_the_nearest() -> None:
         load_network("copper_net").with_options(episod={"horizon": 3})
     with pytest.raises(CirlError, match="fixed order"):
         parallel_env("copper_net", agents={"mine", "use"})
+
+
+class Unconvertible:
+    """What NumPy cannot make an array of, as a tensor that requires a gradient."""
+
+    def __array__(self, dtype: object = None, copy: object = None) -> NDArray[np.float32]:
+        """Refuse, as PyTorch does."""
+        raise RuntimeError("Can't call numpy() on Tensor that requires grad.\nMore.")
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.ma.masked_array([0.5], mask=[True]), "is masked in part"),
+        (Unconvertible(), "is no array of numbers: Can't call numpy.. on Tensor that requires grad.$"),
+    ],
+)
+def test_actions_that_are_no_numbers(action: Any, message: str) -> None:
+    """A masked entry is none, and what NumPy refuses is refused with its reason, in both views."""
+    for env, shown in ((parallel_env("copper_net"), action), (vector_env("copper_net", 1), _in_batch(action))):
+        env.reset(seed=0)
+        actions = {agent: np.zeros(shape) for agent, shape in _shapes(env).items()}
+        env.step({**actions, "mine": np.ma.masked_array(actions["mine"], mask=False)})  # type: ignore[arg-type]
+        with pytest.raises(ControlError, match=f"action of agent 'mine' {message}"):
+            env.step({**actions, "mine": shown})
+
+
+def _in_batch(action: Any) -> Any:
+    return action[None] if isinstance(action, np.ma.MaskedArray) else action
+
+
+def _shapes(env: Any) -> dict[str, tuple[int, ...]]:
+    copies = (env.num_envs,) if isinstance(env, MultiAgentVectorEnv) else ()
+    return {agent: (*copies, *space.shape) for agent, space in env.action_spaces.items()}
+
+
+def test_messages_stay_readable() -> None:
+    """What a file has too much of is not repeated; the beginning and the end of a message, with the remedy, stay."""
+    error = CirlError(f"{'x' * 180_000}: the end\nsecond line")
+    first, second = str(error).split("\n")
+    assert len(first) <= 1200 and first.startswith("xxx") and first.endswith("the end") and "180009 characters" in first
+    assert second == "second line"
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)

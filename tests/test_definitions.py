@@ -12,6 +12,7 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
+import tomlkit
 from numpy.typing import NDArray
 from small_networks import ONE_OF_EACH, constant
 
@@ -413,6 +414,47 @@ def test_what_counts_as_finite_time_sustainable(roles: tuple[str, str], signs: t
     for pollutant, sign in zip((True, False), signs, strict=True):
         arc = Arc(id="k", donor="a", recipient="b", rate=0.1, pollutant=pollutant)
         assert Network(name="two", nodes=nodes, arcs=(arc,)).sustainability.tolist() == [sign]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (f"{'.'.join('a' * 3000)} = 1", r"nested too deeply"),
+        (f"x = {'[' * 600}{']' * 600}", r"nested too deeply"),
+        (f"x = 1\ny = {'9' * 5000}", r"line 2: is an integer of thousands of digits; more than 18 are not possible"),
+        (f"x = {'9' * 30}", r"x: is an integer of 30 digits; more than 18 are not possible"),
+    ],
+)
+def test_files_that_are_too_deep_or_too_long(text: str, message: str, tmp_path: Path) -> None:
+    """They are refused in a line, however deep or long they are."""
+    (tmp_path / "x.toml").write_text(text)
+    with pytest.raises(DefinitionError, match=message) as error:
+        load_network(tmp_path / "x.toml")
+    assert len(str(error.value)) < 500
+
+
+def test_a_missing_column_is_said_itself(tmp_path: Path) -> None:
+    """Not what follows from it: a history that is read from a file needs the file."""
+    text = (folder("envs") / "plastics_world.toml").read_text()
+    (tmp_path / "x.toml").write_text(text)
+    with pytest.raises(DefinitionError, match=r"nodes\.\w+\.history: file 'plastics_world.csv': is not there") as error:
+        load_network(tmp_path / "x.toml")
+    assert "must be a series" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("table", "value"),
+    [(table, value) for table in ("nodes", "arcs", "services") for value in ("[]", "5", '"x"')]
+    + [("agents", value) for value in ("{}", "5", '"x"')],
+)
+def test_mutated_copies_are_refused(table: str, value: str, tmp_path: Path) -> None:
+    """A definition with copies whose tables are something else is refused by name."""
+    (tmp_path / "steel.toml").write_text((folder("envs") / "steel.toml").read_text())
+    document = tomllib.loads((folder("envs") / "steel_world.toml").read_text())
+    others = {key: entry for key, entry in document.items() if key not in (table, "scenarios")}
+    (tmp_path / "x.toml").write_text(f"{table} = {value}\n{tomlkit.dumps(others)}")
+    with pytest.raises(DefinitionError, match=rf"{table}: must be a (table|list of names)"):
+        load_network(tmp_path / "x.toml")
 
 
 def test_missing_file(tmp_path: Path) -> None:

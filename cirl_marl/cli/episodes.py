@@ -121,12 +121,14 @@ def _sample(
     causes = sensitivities(episodes) if samples >= FEWEST else []
     title = f"{network.title or network.name}, {controls[0]} control, {samples} samples"
     paths = write_samples(folder, stem(network, controls[0]), episodes, causes, title=title)
-    mean = episodes.circularity.mean(axis=1)
-    low, high = np.quantile(mean, (0.025, 0.975)).tolist()
-    say(f"λ̄ = {mean.mean():.5g} {network.mass_unit}, 95 % of samples in [{low:.5g}, {high:.5g}]")
-    for service, levels in zip(network.services, episodes.levels.mean(axis=2).T, strict=True):
-        low, high = np.quantile(levels, (0.025, 0.975)).tolist()
-        say(f"level of {service.id}: {levels.mean():.4f}, 95 % of samples in [{low:.4f}, {high:.4f}]")
+    # a few bad samples draw the mean out of the interval, so that the median stands beside it
+    figures = [("λ̄", f" {network.mass_unit}", ".5g", episodes.circularity.mean(axis=1))]
+    levels = zip(network.services, episodes.levels.mean(axis=2).T, strict=True)
+    figures += [(f"level of {service.id}", "", ".4f", level) for service, level in levels]
+    for name, unit, form, values in figures:
+        low, median, high = np.quantile(values, (0.025, 0.5, 0.975)).tolist()
+        spread = f"median {median:{form}}{unit}, 95 % of samples in [{low:{form}}, {high:{form}}]"
+        say(f"{name}: {spread}; mean {values.mean():{form}}{unit}")
     if causes:
         console.print(sensitivity_table(episodes, causes))
     else:

@@ -108,7 +108,9 @@ class Converter:
         try:
             return record(**fields)
         except NetworkError as error:
-            raise NetworkError(self.table.name, [f"{path}: {problem}" for problem in error.problems]) from None
+            # what could not be read stands in ``fields`` as a number, so that a fault may only follow from that
+            problems = self.mistakes or [f"{path}: {problem}" for problem in error.problems]
+            raise NetworkError(self.table.name, problems) from None
 
     def _read(self, declaration: Declaration, entry: Any, table: Any, path: str) -> Any:
         """Return what a declared field is in Python."""

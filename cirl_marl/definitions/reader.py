@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import difflib
 import hashlib
+import re
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -28,6 +29,9 @@ DEFAULT = "default"
 """The scenario that stands outside ``[scenarios]``."""
 LARGEST = 64 * 2**20
 """Bytes of the largest definition that is read."""
+DEEPEST = 50
+"""Tables within tables, more than any definition has."""
+DIGITS = "more than 18 are not possible"
 
 
 class Definition:
@@ -188,20 +192,28 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise DefinitionError(str(path), [toml_mistake(error, text)]) from error
     except RecursionError:
         raise DefinitionError(str(path), ["tables or lists are nested too deeply"]) from None
-    except ValueError as error:  # an integer of thousands of digits
-        raise DefinitionError(str(path), [f"a number cannot be read: {error}"]) from error
-    if mistakes := list(_too_long(document, "")):
+    except ValueError:  # Python reads no integer of thousands of digits
+        lines = (number for number, line in enumerate(text.split("\n"), 1) if re.search(r"[0-9_]{4000}", line))
+        place = f"line {next(lines, '?')}"
+        raise DefinitionError(str(path), [f"{place}: is an integer of thousands of digits; {DIGITS}"]) from None
+    if mistakes := list(_impossible(document)):
         raise DefinitionError(str(path), mistakes)
     return document
 
 
-def _too_long(value: Any, path: str) -> Iterator[str]:
-    """Yield where integers are that no TOML file may hold."""
-    if isinstance(value, dict | list):
-        for key, entry in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from _too_long(entry, f"{path}.{key}".lstrip("."))
-    elif isinstance(value, int) and not -(2**63) <= value < 2**63:
-        yield f"{path}: is an integer of {len(str(value))} digits; more than 18 are not possible"
+def _impossible(document: Mapping[str, Any]) -> Iterator[str]:
+    """Yield where integers are that no TOML file may hold, or where tables are nested too deeply to mean anything."""
+    entries: list[tuple[str, int, Any]] = [("", 0, document)]
+    while entries:
+        path, depth, value = entries.pop()
+        if isinstance(value, dict | list):
+            if depth > DEEPEST:
+                yield f"{path[:100]}…: tables or lists are nested too deeply"
+                return
+            parts = value.items() if isinstance(value, dict) else enumerate(value)
+            entries += [(f"{path}.{key}".lstrip("."), depth + 1, entry) for key, entry in parts]
+        elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+            yield f"{path}: is an integer of {len(str(value))} digits; {DIGITS}"
 
 
 def _strangers(document: Mapping[str, Any], override: Mapping[str, Any], prefix: str) -> Iterator[str]:

@@ -51,6 +51,11 @@ def compose_copies(
     if not isinstance(texts, Mapping) or not texts or "copies" in original:
         fault = "has copies itself" if "copies" in original else "has no [regions], and a copy is of a region"
         raise NetworkError(table.of, [f"copies.of: '{table.of}' {fault}"])
+    forms = [f"{part}: must be a table" for part in NAME_KEYS if not isinstance(document.get(part, {}), Mapping)]
+    if not isinstance(document.get("agents", []), list):
+        forms.append("agents: must be a list of names")
+    if forms:
+        raise NetworkError(table.of, forms)
     pattern = _pattern(document, original, scenario)
     document_ = {k: dict(v) if isinstance(v, Mapping) else v for k, v in document.items() if k != "scenarios"}
     mistakes = [

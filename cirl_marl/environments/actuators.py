@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from cirl_marl.errors import CirlError, ControlError, unknown_name
 from cirl_marl.network import Floats, Integers, Network
@@ -71,7 +72,7 @@ class Actuators:
         for agent, entries in self.entries.items():
             if agent not in actions:
                 raise ControlError(self._wrong_agents(actions))
-            action = np.asarray(actions[agent])
+            action = action_array(agent, actions[agent])
             shape = (self.num_envs, entries.stop - entries.start)
             if action.shape != shape:
                 raise ControlError(wrong_shape(agent, action.shape, shape))
@@ -117,6 +118,21 @@ class Actuators:
         entry, copy_ = np.argwhere(wrong)[0]
         agent = next(agent for agent, entries in self.entries.items() if entries.start <= entry < entries.stop)
         return f"action of agent '{agent}' in copy {copy_} is {actions[entry, copy_]}; it must be a number in [-1, 1]"
+
+
+def action_array(agent: str, action: ArrayLike) -> NDArray[Any]:
+    """Return an agent's action as an array.
+
+    Raises:
+        ControlError: for what is no array, such as a tensor that requires a gradient, and for masked entries.
+    """
+    if isinstance(action, np.ma.MaskedArray) and np.ma.is_masked(action):
+        raise ControlError(f"action of agent '{agent}' is masked in part; it must hold numbers in [-1, 1]")
+    try:
+        return np.asarray(action)
+    except (RuntimeError, TypeError, ValueError) as error:
+        reason = str(error).split("\n")[0]
+        raise ControlError(f"action of agent '{agent}' is no array of numbers: {reason}") from error
 
 
 def wrong_shape(agent: str, shape: tuple[int, ...], space_shape: tuple[int, ...]) -> str:

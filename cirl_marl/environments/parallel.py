@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import conversions
 
-from cirl_marl.environments.actuators import wrong_shape
+from cirl_marl.environments.actuators import action_array, wrong_shape
 from cirl_marl.environments.state import Outcome, Snapshot
 from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv, Observations
 from cirl_marl.errors import CirlError, ControlError, unknown_name
@@ -187,8 +187,10 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         if not isinstance(actions, Mapping):
             raise ControlError(f"actions must be a mapping agent → action, not {actions!r}")
         try:
-            joint = np.array([actions[agent] for agent in self.possible_agents])
-        except (KeyError, ValueError):
+            parts = [actions[agent] for agent in self.possible_agents]
+            has_mask = any(isinstance(part, np.ma.MaskedArray) for part in parts)
+            joint = np.empty(0) if has_mask else np.array(parts)
+        except (KeyError, RuntimeError, TypeError, ValueError):
             joint = np.empty(0)
         fits = joint.shape == (self._entries, 1) and len(actions) == len(self.possible_agents)
         if not fits or joint.dtype.kind not in "biuf":
@@ -197,7 +199,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
 
     def _as_row(self, agent: str, action: ArrayLike) -> NDArray[Any]:
         """Refuse an action of the wrong shape; the batch would say it with an axis that is not the user's."""
-        row, space = np.asarray(action), self.batch.action_spaces.get(agent)
+        row, space = action_array(agent, action), self.batch.action_spaces.get(agent)
         if space is not None and row.shape != space.shape:
             raise ControlError(wrong_shape(agent, row.shape, space.shape))
         return row[None]

@@ -103,11 +103,12 @@ class Starts:
 
     def _new_streams(self, seed: int | Sequence[int]) -> list[np.random.Generator]:
         copies = len(self.streams)
-        if isinstance(seed, int | np.integer):
+        if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
             seeds = [int(seed) + i for i in range(copies)]
         else:
-            seeds = list(seed) if isinstance(seed, Sequence | np.ndarray) else []
-        if len(seeds) != copies or any(not isinstance(s, int | np.integer) or s < 0 for s in seeds):
+            seeds = list(seed) if isinstance(seed, Sequence | np.ndarray) and np.ndim(seed) == 1 else []
+        whole = all(isinstance(s, int | np.integer) and not isinstance(s, bool) and s >= 0 for s in seeds)
+        if len(seeds) != copies or not whole:
             raise ControlError(f"seed {seed!r} must be a non-negative integer, or {copies} of them")
         return [np.random.default_rng(s) for s in seeds]
 

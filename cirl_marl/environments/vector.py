@@ -27,6 +27,9 @@ from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.calendar import years
 from cirl_marl.network.elements import MOMENTS, REWARDS
 
+MOST = 2**24
+"""Most copies, and most decisions of an episode."""
+
 Infos = dict[str, dict[str, Any]]
 Observations = dict[str, NDArray[np.float32]]
 Flags = dict[str, NDArray[np.bool_]]
@@ -110,6 +113,8 @@ class MultiAgentVectorEnv:
         for name, value in (("num_envs", num_envs), ("horizon", default if horizon is None else horizon)):
             if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
                 raise CirlError(f"{name} must be a whole number of at least 1, got {value!r}")
+            if value > MOST:
+                raise CirlError(f"{name} must be at most {MOST:,}, got {value:,}: no memory holds as many")
         if horizon is not None:
             variant = variant.with_options(episode={"horizon": horizon})
         if circularity_weight is not None:

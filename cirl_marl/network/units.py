@@ -97,7 +97,9 @@ def factor(unit: str, target: str) -> float:
         raise CirlError(f"unit '{unit}' is inconsistent: a quantity in '{target}' is needed ({error})") from error
     except (*unreadable, ValueError, tokenize.TokenError) as error:
         form = "write units as in kg, t/day, 1/day or m**3"
-        raise CirlError(f"unit '{unit}' cannot be read: {str(error) or 'it breaks off'}; {form}") from error
+        has_reason = isinstance(error, pint.errors.UndefinedUnitError | ArithmeticError)
+        fault = str(error) if has_reason else "it is no product of units and their powers"
+        raise CirlError(f"unit '{unit}' cannot be read: {fault}; {form}") from error
     if zero != 0.0:
         raise CirlError(f"unit '{unit}': its zero is another than that of '{target}'; give numbers in '{target}'")
     return scale

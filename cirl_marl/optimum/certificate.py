@@ -51,9 +51,13 @@ def verify(problem: Program, certificate: Certificate, plan: Floats) -> Verifica
         plan: v of the plan, for its objective.
 
     Raises:
-        CirlError: for a multiplier that is not finite; names its row.
+        CirlError: for a multiplier that is not finite, which names its row, or multipliers of another program.
     """
-    for rows, multipliers in (("A", certificate.equal), ("G", certificate.under)):
+    pairs = (("A", certificate.equal, problem.equal), ("G", certificate.under, problem.under))
+    for rows, multipliers, matrix in pairs:
+        if np.shape(multipliers) != matrix.shape[:1]:
+            shape = np.shape(multipliers)
+            raise CirlError(f"certificate: multipliers of {rows} have shape {shape}, its rows {matrix.shape[:1]}")
         if not np.isfinite(multipliers).all():
             row = int(np.flatnonzero(~np.isfinite(multipliers))[0])
             raise CirlError(f"certificate: the multiplier of row {row} of {rows} is {multipliers[row]}")
