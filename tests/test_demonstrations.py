@@ -326,7 +326,7 @@ demonstrations = { controller = "scripted", steps = 50 }
     ("old", "new", "message"),
     [
         ('"scripted"', '"scriptd"', "learner.demonstrations.controller: unknown value 'scriptd'. Did you mean 'script"),
-        ("steps = 50", "steps = 0", "learner.demonstrations.steps: Input should be greater than 0, got 0"),
+        ("steps = 50", "steps = 0", "learner.demonstrations.steps: must be more than 0, got 0"),
         ("steps = 50", "step = 50", "learner.demonstrations.step: unknown key 'step'. Did you mean 'steps'?"),
         ("steps = 50", "steps = 101", "learner.demonstrations.steps: 101 is more than the 100 steps of the run"),
         ("[learner]", "[learner]\nshare_of_steps = 0.4", "50 is more than the 100 steps of the run times share_of_"),

@@ -86,7 +86,7 @@ def test_without_a_region_those_there_are_are_named(tmp_path: Path, asked: str, 
     [
         (REGIONS, "", "arcs.ore.flow.where.country: '{region}': a definition without [regions] has no {region}"),
         (REGIONS, "", "title: 'Ores of {region}': a definition without [regions] has no {region}"),
-        ('"Japan"', "3", "regions.japan: Input should be a valid string, got 3"),
+        ('"Japan"', "3", "regions.japan: must be a text, got 3"),
         ("china", "China", "regions.China: begins with a letter and has lower-case letters, digits and _ only"),
         (
             SCENARIO,

@@ -17,6 +17,7 @@ import cirl_marl
 from cirl_marl import MultiAgentVectorEnv, RunError
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.learners import run_directory as learners_run
+from cirl_marl.learners.checkpoint import write_tree
 from cirl_marl.learners.interface import Trained, resume, train
 from cirl_marl.learners.recipe import LearnerSettings, Normalisation, Recipe, Run
 from cirl_marl.learners.run_directory import RunDirectory
@@ -280,3 +281,11 @@ def test_run_opens_with_the_horizon_that_it_was_trained_with(tmp_path: Path, ppo
     for training in (in_network, as_option):
         assert training.run is not None
         assert training.run.make_env(1).network.episode.horizon == 7
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full, a disk that is always full")
+def test_a_full_disk_is_said_in_a_line(tmp_path: Path) -> None:
+    """The file, and what the system says of it."""
+    (tmp_path / "learner.safetensors").symlink_to("/dev/full")
+    with pytest.raises(OSError, match=r"learner.safetensors: cannot be written: .*No space left on device"):
+        write_tree(tmp_path, "learner", {"weights": np.zeros(10)})

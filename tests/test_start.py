@@ -315,7 +315,7 @@ start = { run = "runs/first", agent = "mine" }
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('"runs/first"', "3", "learner.start.run: Input should be a valid string, got 3"),
+        ('"runs/first"', "3", "learner.start.run: must be a text, got 3"),
         ('"runs/first"', '""', "learner.start.run: String should have at least 1 character, got ''"),
         (
             "run =",
@@ -323,7 +323,7 @@ start = { run = "runs/first", agent = "mine" }
             "learner.start.runn: unknown key 'runn'. Did you mean 'run'? Known: run, agent, last_layer.",
         ),
         ('{ run = "runs/first", agent = "mine" }', '"runs/first"', "learner.start: must be a table { run = … }, got"),
-        ("share_of_steps = 0", "share_of_steps = -0.1", "share_of_steps: Input should be greater than or equal to 0"),
+        ("share_of_steps = 0", "share_of_steps = -0.1", "share_of_steps: must be at least 0"),
         ("start =", "# start =", "learner.share_of_steps: 0, so that it never learns: give a start by which it acts"),
     ],
 )

@@ -14,6 +14,21 @@ from pydantic import BaseModel, ValidationError
 from cirl_marl.definitions.quantities import FORMS, forms
 from cirl_marl.errors import unknown_name
 
+REQUIREMENTS = {
+    "bool_type": "must be true or false",
+    "dict_type": "must be a table",
+    "finite_number": "must be a finite number",
+    "float_type": "must be a number",
+    "greater_than": "must be more than {gt:g}",
+    "greater_than_equal": "must be at least {ge:g}",
+    "int_type": "must be a whole number",
+    "less_than": "must be less than {lt:g}",
+    "less_than_equal": "must be at most {le:g}",
+    "list_type": "must be a list",
+    "string_type": "must be a text",
+    "tuple_type": "must be a list",
+}
+"""What a value must be, by the kind of pydantic's error; what stands in braces is from its context."""
 BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
 """Kinds of the parameters that a definition can give."""
 
@@ -52,7 +67,12 @@ def validation_mistakes(error: ValidationError, model: type[BaseModel]) -> list[
 
 def _mistake(item: Mapping[str, Any], model: type[BaseModel]) -> str:
     location = [str(part) for part in item["loc"] if part != "[key]"]
-    path = ".".join(part for part in location if part not in FORMS) or "file"
+    path = "".join(
+        f", entry {part + 1}" if isinstance(part, int) else f".{part}"
+        for part in item["loc"]
+        if part not in ("[key]", *FORMS)
+    ).lstrip(".,")
+    path = path or "file"
     if item["type"] == "extra_forbidden" and location[::2] == ["arcs", "series"]:
         return f"{path}: write flow = {{ times = […], values = […], time_unit = …, unit = …, source = … }}"
     if item["type"] == "extra_forbidden":
@@ -70,7 +90,9 @@ def _mistake(item: Mapping[str, Any], model: type[BaseModel]) -> str:
         return f"{path}: must be a table {{ {', '.join(f'{key} = …' for key in keys)} }}, got {item['input']!r}"
     if item["type"] == "string_pattern_mismatch":
         return f"{path}: begins with a letter and has lower-case letters, digits and _ only, got {item['input']!r}"
-    return f"{path}: {item['msg']}, got {item['input']!r}"
+    message = str(item["msg"]).removeprefix("Value error, ").replace("Input should be", "must be")
+    requirement = REQUIREMENTS.get(item["type"], message).format_map(item.get("ctx", {}))
+    return f"{path}: {requirement}, got {item['input']!r}"
 
 
 def choices(sentence: str) -> list[str]:

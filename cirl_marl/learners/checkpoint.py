@@ -35,10 +35,15 @@ def write_tree(folder: Path, name: str, value: Any) -> None:
 
     Raises:
         TypeError: for anything else.
+        OSError: if they cannot be written, as on a full disk.
     """
     arrays: dict[str, np.ndarray[Any, Any]] = {}
     text = json.dumps(_to_json(value, arrays, ()))
-    save_file(arrays, folder / f"{name}.safetensors")
+    path = folder / f"{name}.safetensors"
+    try:
+        save_file(arrays, path)
+    except SafetensorError as error:
+        raise OSError(f"{path}: cannot be written: {error}") from error
     (folder / f"{name}.json").write_text(text + "\n")
 
 
