@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import astuple
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated
@@ -176,7 +175,7 @@ def _write(folder: Path, file: str, name: str, definition: ImportedFiles, change
     """Write the files and return their names."""
     header = ["region", "year", "source", "target", "type", "before", "after", "deviation", "in deviations"]
     change_rows = [
-        [c.region, c.year, *astuple(c.pair), c.before, c.after, c.deviation, c.in_deviations]
+        [c.region, c.year, *c.pair, c.before, c.after, c.deviation, c.in_deviations]
         for c in sorted(changes, key=lambda change: -abs(change.after - change.before))
     ]
     tables: dict[str, list[list[object]]] = {

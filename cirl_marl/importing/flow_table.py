@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 from zipfile import BadZipFile
 
 from cirl_marl.definitions.data_files import Line, csv_lines, even_lines, number_in
@@ -29,8 +29,7 @@ NAMES: Mapping[str, tuple[str, ...]] = {
 WORKBOOKS = (".xlsx", ".xlsm")
 
 
-@dataclass(frozen=True, order=True, slots=True)
-class Connection:
+class Connection(NamedTuple):
     """What a flow is: from which process to which, and of what type if the table says so."""
 
     source: str
@@ -88,6 +87,7 @@ class _Grid:
     header: list[str]
     rows: list[Line]
     places: dict[str, int] = field(init=False)
+    years: dict[str, int] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         plain = [title.strip().lower() for title in self.header]
@@ -110,20 +110,22 @@ class _Grid:
         Raises:
             CirlError: naming file, line, column and text, if it is none or below ``least``.
         """
-        label = f"{self.name}, line {line}, column '{column}'"
         value = number_in(text)
+        if least <= value < math.inf:
+            return value
+        label = f"{self.name}, line {line}, column '{column}'"
         if not math.isfinite(value):
             raise CirlError(f"{label}: '{text}' is no number; write one as in 1234.5, or leave out the row")
-        if value < least:
-            hint = "; a flow runs from source to target: swap them" if least == 0.0 else ""
-            raise CirlError(f"{label}: {text} is negative{hint}")
-        return value
+        hint = "; a flow runs from source to target: swap them" if least == 0.0 else ""
+        raise CirlError(f"{label}: {text} is negative{hint}")
 
     def year(self, line: int, text: str) -> int:
-        value = self.number(line, text, self.header[self.places["year"]], least=-math.inf)
-        if value != round(value):
-            raise CirlError(f"{self.name}, line {line}: '{text}' is no whole year")
-        return int(value)
+        if text not in self.years:
+            value = self.number(line, text, self.header[self.places["year"]], least=-math.inf)
+            if value != round(value):
+                raise CirlError(f"{self.name}, line {line}: '{text}' is no whole year")
+            self.years[text] = int(value)
+        return self.years[text]
 
 
 def read_flows(path: Path, *, sheet: str | None = None, unit: str | None = None, year: int | None = None) -> FlowTable:
@@ -145,20 +147,21 @@ def read_flows(path: Path, *, sheet: str | None = None, unit: str | None = None,
     """
     grids = list(_grids(path, sheet))
     flows: dict[tuple[str, int, Connection], float] = {}
-    lines: dict[tuple[str, int, Connection], str] = {}
+    lines: dict[tuple[str, int, Connection], int] = {}
     deviations: dict[tuple[str, int, Connection], float] = {}
     units: dict[str, str] = {}
     for grid in grids:
         long = {"source", "target"} <= grid.places.keys()
         for line, key, value, unit_of_row, deviation in _long(grid, year) if long else _matrix(grid, year):
-            place = f"{grid.name}, line {line}"
             if key in flows:
                 flow_text = f"{key[2]} in {key[1]}{f' in {key[0]}' if key[0] else ''}"
-                raise CirlError(f"{place}: {flow_text} stands in {lines[key]} too; leave one out, or give them types")
+                fault = f"{flow_text} stands in line {lines[key]} too; leave one out, or give them types"
+                raise CirlError(f"{grid.name}, line {line}: {fault}")
             if key[2].source == key[2].target:
-                raise CirlError(f"{place}: {key[2]}: a flow needs two processes")
-            flows[key], lines[key] = value, f"line {line}"
-            units.setdefault(unit_of_row, place)
+                raise CirlError(f"{grid.name}, line {line}: {key[2]}: a flow needs two processes")
+            flows[key], lines[key] = value, line
+            if unit_of_row not in units:
+                units[unit_of_row] = f"{grid.name}, line {line}"
             if deviation is not None:
                 deviations[key] = deviation
     if not flows:
@@ -205,19 +208,22 @@ def _long(grid: _Grid, default_year: int | None) -> Iterator[_Entry]:
         unit = grid.header[unit_columns[0]].strip().lower().replace("_per_", "/")
     if default_year is None:
         _needs(grid, ("year",))
+    columns = [grid.places.get(key) for key in ("source", "target", "type", "region", "year", "value")]
     for line, row in grid.rows:
-        pair = Connection(grid.at(row, "source"), grid.at(row, "target"), grid.at(row, "type"))
+        cells = ["" if column is None else row[column].strip() for column in columns]
+        source, target, type_, region, year_text, value_text = cells
+        pair = Connection(source, target, type_)
         if not pair.source or not pair.target:
             raise CirlError(f"{grid.name}, line {line}: a flow needs a source and a target")
-        year = default_year if "year" not in grid.places else grid.year(line, grid.at(row, "year"))
+        year = default_year if columns[4] is None else grid.year(line, year_text)
         assert year is not None
-        value = grid.number(line, grid.at(row, "value"), grid.header[grid.places["value"]])
+        value = grid.number(line, value_text, grid.header[grid.places["value"]])
         deviation = None
         if uncertainty := grid.at(row, "uncertainty"):
             column = grid.header[grid.places["uncertainty"]]
             relative = uncertainty.endswith("%")
             deviation = grid.number(line, uncertainty.rstrip("% "), column) * (value / 100 if relative else 1.0)
-        yield line, (grid.at(row, "region"), year, pair), value, unit or grid.at(row, "unit"), deviation
+        yield line, (region, year, pair), value, unit or grid.at(row, "unit"), deviation
 
 
 def _matrix(grid: _Grid, default_year: int | None) -> Iterator[_Entry]:
