@@ -296,7 +296,7 @@ def test_actions_that_are_no_numbers(action: Any, message: str) -> None:
     for env, shown in ((parallel_env("copper_net"), action), (vector_env("copper_net", 1), _in_batch(action))):
         env.reset(seed=0)
         actions = {agent: np.zeros(shape) for agent, shape in _shapes(env).items()}
-        env.step({**actions, "mine": np.ma.masked_array(actions["mine"], mask=False)})  # type: ignore[arg-type]
+        env.step({**actions, "mine": np.ma.masked_array(actions["mine"], mask=False)})
         with pytest.raises(ControlError, match=f"action of agent 'mine' {message}"):
             env.step({**actions, "mine": shown})
 
