@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from openpyxl import Workbook
 from scipy.optimize import lsq_linear, minimize
+from scipy.stats import chi2, kstest
 from typer.testing import CliRunner
 
 from cirl_marl import CirlError, MultiAgentVectorEnv, load_network
@@ -23,7 +24,7 @@ from cirl_marl.controllers.rollout import episode_start, rollout
 from cirl_marl.importing.assembly import ImportReport, import_flows
 from cirl_marl.importing.balances import Processes, ProcessKind, _closest
 from cirl_marl.importing.definition import identifiers, shares_of
-from cirl_marl.importing.flow_table import Connection, read_flows
+from cirl_marl.importing.flow_table import Connection, FlowTable, read_flows
 from cirl_marl.network.elements import Role
 
 Row = Sequence[object]
@@ -415,3 +416,47 @@ def test_roles_can_be_asked_for(tmp_path: Path) -> None:
     found: ImportReport = import_flows(table(tmp_path / "f.csv", cycle()), tmp_path / "m.toml", roles={}, ask=ask)
     assert asked == [("Ore body", ProcessKind.SOURCE), ("Dumps", ProcessKind.SINK)]
     assert found.roles == {"Ore body": Role.NONRENEWABLE_RESERVOIR, "Dumps": Role.LANDFILL}
+
+
+def test_how_plausible_an_adjustment_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One balance of two flows: χ² = (a − b)²/(σ_a² + σ_b²) with one degree of freedom; a contradiction is said."""
+    header = ["source", "target", "year", "value", "unit", "uncertainty"]
+    for value, warned in (("14", False), ("40", True)):
+        rows = [["Ore", "Works", 2000, "10", "t/year", "1"], ["Works", "Use", 2000, value, "t/year", "2"]]
+        path, out = table(tmp_path / f"flows{value}.csv", rows, header), tmp_path / f"net{value}.toml"
+        roles = {"nonrenewable_reservoir": ["Ore"], "technosphere": ["Use"]}
+        found = import_flows(path, out, roles=roles, reconcile=True).reconciliation
+        assert found is not None
+        expected = (float(value) - 10) ** 2 / (1 + 4)
+        assert found.chi_square == pytest.approx(expected) and found.degrees == 1
+        assert found.p_value == pytest.approx(chi2.sf(expected, 1))
+        # the changes share the difference in proportion to the variances
+        moved = {change.pair.target: change.in_deviations for change in found.changes}
+        assert moved["Works"] == pytest.approx((float(value) - 10) / 5) and moved["Use"] == pytest.approx(
+            -2 * moved["Works"]
+        )
+        assert [change.pair.target for change in found.far] == (["Use", "Works"] if warned else [])
+        words = ["import", str(path), "--out", str(tmp_path / f"again{value}.toml"), "--reconcile"]
+        app([*words, "--reservoir", "Ore", "--outside", "Use"], standalone_mode=False)
+        said = capsys.readouterr().out
+        assert "with 1 degrees of freedom" in said and "from the adjusted table" in said
+        assert ("warning: flows contradict each other" in said) is warned
+
+
+def test_p_values_of_true_uncertainties_are_uniform() -> None:
+    """Over tables whose flows balance and err as they state, as the definition of a p-value has it."""
+    rng, p_values = np.random.default_rng(5), []
+    pairs = [Connection("Ore", "A"), Connection("Ore", "B"), Connection("A", "B"), Connection("A", "Use")]
+    pairs += [Connection("B", "Use"), Connection("B", "Dump"), Connection("B", "A")]
+    true, deviation = (
+        np.array([50.0, 40.0, 30.0, 45.0, 30.0, 15.0, 25.0]),
+        np.array([2.0, 1.0, 3.0, 2.0, 1.0, 1.0, 2.0]),
+    )
+    for _ in range(200):
+        measured = true + deviation * rng.standard_normal(7)
+        flows = {("", 2000, pair): float(flow) for pair, flow in zip(pairs, measured, strict=True)}
+        errors = {("", 2000, pair): float(error) for pair, error in zip(pairs, deviation, strict=True)}
+        _, found = Processes(FlowTable("t", "t/year", flows, errors), ["Use"]).reconcile()
+        assert found.degrees == 2
+        p_values.append(found.p_value)
+    assert kstest(p_values, "uniform").pvalue > 0.01

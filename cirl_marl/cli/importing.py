@@ -11,9 +11,12 @@ import typer
 from cirl_marl.cli.common import NETWORKS, app, bar, say
 
 if TYPE_CHECKING:
+    from cirl_marl.importing.balances import Reconciliation
     from cirl_marl.network.elements import Role
 
 Patterns = list[str] | None
+IMPLAUSIBLE = 0.01
+"""p-value of an adjustment below which the table is said to contradict itself."""
 CHANGES_SHOWN = 12
 """Most changes that are listed on screen."""
 
@@ -84,10 +87,25 @@ def import_(
         for change in sorted(report.changes, key=lambda entry: -abs(entry.after - entry.before))[:CHANGES_SHOWN]:
             place = f"{change.region}, {change.year}" if change.region else str(change.year)
             say(f"  {change.pair} ({place}): {change.before:g} → {change.after:g} {table.unit}")
+    if report.reconciliation is not None:
+        _say_plausibility(report.reconciliation)
     for name, apart in report.stock_mistakes.items():
         say(f"stocks of '{name}': their growth and the flows are up to {apart:g} {table.unit} apart")
-    say(f"simulated without agents, no flow is further than {report.largest_error:.2g} {table.unit} from the table")
+    which = "the table" if report.reconciliation is None else "the adjusted table"
+    say(f"simulated without agents, no flow is further than {report.largest_error:.2g} {table.unit} from {which}")
     say(f"wrote {', '.join(map(str, report.files))}")
+
+
+def _say_plausibility(reconciliation: Reconciliation) -> None:
+    """Say how far flows were moved in standard deviations, and warn if the table contradicts itself."""
+    far, p_value = reconciliation.far, reconciliation.p_value
+    degrees = f"{reconciliation.degrees} degrees of freedom"
+    say(f"χ² of the adjustment: {reconciliation.chi_square:.4g} with {degrees}, p = {p_value:.2g}")
+    if far:
+        furthest = f"{far[0].pair} by {abs(far[0].in_deviations):.1f}"
+        say(f"{len(far)} flows were moved by more than two standard deviations, {furthest}")
+    if p_value < IMPLAUSIBLE:
+        say("warning: flows contradict each other more than their uncertainties allow; look at those moved furthest")
 
 
 KINDS = {

@@ -14,7 +14,7 @@ from cirl_marl.controllers.rollout import episode_start, rollout
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, unknown_name
-from cirl_marl.importing.balances import Change, Processes, ProcessKind, Residual
+from cirl_marl.importing.balances import Change, Processes, ProcessKind, Reconciliation, Residual
 from cirl_marl.importing.definition import DefinitionWriter, ImportedFiles, identifiers
 from cirl_marl.importing.flow_table import FlowTable, read_flows, read_stocks
 from cirl_marl.network.declarations import positional_record
@@ -37,10 +37,15 @@ class ImportReport:
     table: Annotated[FlowTable, "the flows, as they were reconciled"]
     processes: Annotated[Processes, "what each process is"]
     roles: Annotated[Mapping[str, Role], "of sources, sinks and stores"]
-    changes: Annotated[tuple[Change, ...], "flows that were adjusted"]
+    reconciliation: Annotated[Reconciliation | None, "how flows were adjusted; None if they balanced"]
     stock_mistakes: Annotated[Mapping[str, float], "by store how far its stocks and flows are apart at most, mass"]
     largest_error: Annotated[float, "largest difference between a simulated flow and the table, mass/time"]
     files: Annotated[tuple[Path, ...], "what was written, the definition first"]
+
+    @property
+    def changes(self) -> tuple[Change, ...]:
+        """Flows that were adjusted."""
+        return () if self.reconciliation is None else self.reconciliation.changes
 
 
 def import_flows(
@@ -90,11 +95,11 @@ def import_flows(
         table = table.of(regions)
     known_stocks = {} if stocks is None else read_stocks(stocks, table.unit.rpartition("/")[0])
     processes = Processes(table, _matching_processes(table, [*stores, *_stock_processes(table, known_stocks)], "store"))
-    changes: list[Change] = []
+    reconciliation: Reconciliation | None = None
     if residuals := processes.residuals:
         if not reconcile:
             raise CirlError(_imbalance_message(table, residuals))
-        table, changes = processes.reconcile()
+        table, reconciliation = processes.reconcile()
         processes = Processes(table, processes.of(ProcessKind.STORE))
     role_of = _roles(table, processes, roles, ask)
     name = identifiers([out.stem])[out.stem]
@@ -110,12 +115,13 @@ def import_flows(
         source=source or f"imported from {flows.name}",
     )
     definition = writer.files()
+    changes = () if reconciliation is None else reconciliation.changes
     with publish_folder(out.parent) as partial:
         files = _write(partial, out.name, name, definition, changes)
         error = _largest_error(partial / out.name, table, definition, progress)
     mistakes = processes.stock_mistakes(known_stocks)
     return ImportReport(
-        table, processes, role_of, tuple(changes), mistakes, error, tuple(out.parent / file for file in files)
+        table, processes, role_of, reconciliation, mistakes, error, tuple(out.parent / file for file in files)
     )
 
 

@@ -8,6 +8,7 @@ from enum import StrEnum
 from typing import Annotated
 
 import numpy as np
+from scipy.special import chdtrc
 
 from cirl_marl.errors import CirlError
 from cirl_marl.importing.flow_table import Connection, FlowTable
@@ -63,6 +64,25 @@ class Change:
     def in_deviations(self) -> float:
         """The change in standard deviations."""
         return (self.after - self.before) / self.deviation
+
+
+@positional_record
+class Reconciliation:
+    """What was changed so that flows balance, and how well that agrees with their uncertainties."""
+
+    changes: Annotated[tuple[Change, ...], "flows that were adjusted"]
+    chi_square: Annotated[float, "Σ ((x − m)/σ)² over all flows"]
+    degrees: Annotated[int, "its degrees of freedom: independent balances of flows that are uncertain"]
+
+    @property
+    def p_value(self) -> float:
+        """Probability of so large a χ², or a larger one, if the flows balance and err as stated."""
+        return float(chdtrc(self.degrees, self.chi_square)) if self.degrees else 1.0
+
+    @property
+    def far(self) -> list[Change]:
+        """Flows that were moved by more than two standard deviations, the furthest first."""
+        return sorted((c for c in self.changes if abs(c.in_deviations) > 2), key=lambda c: -abs(c.in_deviations))
 
 
 class Processes:
@@ -129,8 +149,8 @@ class Processes:
         ]
         return sorted(residuals, key=lambda residual: -abs(residual.inflow - residual.outflow))
 
-    def reconcile(self) -> tuple[FlowTable, list[Change]]:
-        """Return flows that balance and are closest to those of the table, and what was changed.
+    def reconcile(self) -> tuple[FlowTable, Reconciliation]:
+        """Return flows that balance and are closest to those of the table, what was changed, and how plausible that is.
 
         In each region and year they minimise Σ ((x − m)/σ)² for x ≥ 0 and inflow = outflow of every process that
         stores nothing, m the flows of the table and σ their standard deviations, or 10 % of flows that state none
@@ -139,6 +159,7 @@ class Processes:
         table, flows = self._table, dict(self._table.flows)
         rows = np.array([kind is ProcessKind.TRANSIT for kind in self.kinds.values()])
         balances, changes = self._incidence[rows], []
+        chi_square, degrees = 0.0, 0
         for r, region in enumerate(table.regions):
             for y, year in enumerate(table.years):
                 table_flow = self.flows[r, y]
@@ -152,11 +173,14 @@ class Processes:
                     place = f"{region}, {year}" if region else str(year)
                     remedy = "state how uncertain they are"
                     raise CirlError(f"{table.name}: {place}: flows whose uncertainty is 0 do not balance; {remedy}")
+                free = (deviations > 0) & (table_flow > 0)
+                chi_square += float((((closest - table_flow)[free] / deviations[free]) ** 2).sum())
+                degrees += int(np.linalg.matrix_rank(balances[:, free])) if free.any() else 0
                 for k in np.flatnonzero(np.abs(closest - table_flow) > 1e-9 * table_flow.max()).tolist():
                     pair = table.pairs[k]
                     flows[region, year, pair] = float(closest[k])
                     changes.append(Change(region, year, pair, table_flow[k], float(closest[k]), float(deviations[k])))
-        return replace(table, flows=flows), changes
+        return replace(table, flows=flows), Reconciliation(tuple(changes), chi_square, degrees)
 
     def stock_mistakes(self, stocks: Mapping[tuple[str, str, int], float]) -> dict[str, float]:
         """Return, for each process with stocks, the largest difference between their growth and what the flows say.
