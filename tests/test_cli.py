@@ -22,12 +22,13 @@ from small_networks import ONE_OF_EACH
 from some import some
 
 import cirl_marl
-from cirl_marl import Arc, Control, ControlKind, Law, MultiAgentVectorEnv, Network, Node, cli, learners
+from cirl_marl import Arc, Control, ControlKind, Law, MultiAgentVectorEnv, Network, Node, cli
 from cirl_marl.cli import demonstration
 from cirl_marl.controllers.rollout import episode_start, first_seed
 from cirl_marl.definitions.catalogue import folder
 from cirl_marl.definitions.reader import write_network
 from cirl_marl.evaluation.assessment import evaluate
+from cirl_marl.learners import interface
 from cirl_marl.learners.interface import train
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.optimum import search_each
@@ -407,7 +408,7 @@ def test_a_stopped_training_says_what_is_saved(
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(learners, "train", stop)
+    monkeypatch.setattr(interface, "train", stop)
     checkpoint = kept.status["checkpoint"]
     for state, name, said in (
         ("interrupted", checkpoint, "everything learnt is saved. Go on with: cirl train --resume run"),

@@ -116,7 +116,7 @@ class VisitBounds:
                 if short > 0:
                     most: Floats = passes * (1 + SLACK) / min(short, 1.0)
                     return most
-            if not np.isfinite(better).all() or better.min() < 1.0:
+            if not np.isfinite(better).all() or better.min() < 1.0 - SLACK:  # rounding leaves a little less than 1
                 break
             passes = np.maximum(better, passes)
         raise NetworkError(
