@@ -14,13 +14,13 @@ class CirlError(ValueError):
 
     def __init__(self, message: object = "") -> None:
         """Take a message, lines of which that are too long to be read are shortened."""
-        super().__init__("\n".join(map(_shortened, str(message).split("\n"))))
+        super().__init__("\n".join(map(_shorten, str(message).split("\n"))))
 
 
-def _shortened(line: str) -> str:
+def _shorten(line: str) -> str:
     """Return a line without its middle if it is too long.
 
-    >>> len(_shortened("x" * 100_000)) <= LONGEST_LINE
+    >>> len(_shorten("x" * 100_000)) <= LONGEST_LINE
     True
     """
     if len(line) <= LONGEST_LINE:

@@ -6,7 +6,10 @@ set -euo pipefail
 folder=$(realpath -m "$1"); what=${2:-plain}
 if [ "$what" = stop ]; then
   for name in slurmd slurmctld slurmdbd mariadbd munged; do
-    [ -f "$folder/$name.pid" ] && kill "$(cat "$folder/$name.pid")" 2> /dev/null || true
+    [ -f "$folder/$name.pid" ] || continue
+    pid=$(cat "$folder/$name.pid")
+    kill "$pid" 2> /dev/null || continue
+    for _ in $(seq 100); do kill -0 "$pid" 2> /dev/null || break; sleep 0.2; done  # its port must be free again
   done
   exit 0
 fi

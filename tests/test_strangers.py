@@ -298,7 +298,7 @@ def test_what_is_no_network_agent_or_seed(tmp_path: Path) -> None:
     np.testing.assert_array_equal(first, alone.reset(seed=3)[0])
     for line, said in (
         ("x = " + "[" * 5000 + "]" * 5000, "nested too deeply"),
-        ("x = " + "9" * 5000, "a number cannot be read"),
+        ("x = " + "9" * 5000, "thousands of digits"),
         ("x = " + "9" * 30, "x: is an integer of 30 digits"),
     ):
         path.write_text(line + "\n" + text)
