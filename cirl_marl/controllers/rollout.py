@@ -105,9 +105,8 @@ def rollout(
         outcome = env.advance(env.stack(controller.act(observations)))
         controls[t] = env.controls[:, 0]
         if len(orders):
-            ordered_flow = env.dynamics.rate(env.controls, np.full(env.num_envs, t), env.physical.factors_if_any)[
-                orders
-            ]
+            step = np.full(env.num_envs, t)
+            ordered_flow = env.dynamics.rate(env.controls, step, env.factors_in(step))[orders]
             short = ordered_flow - outcome.flow[orders]
             shortage[t] = np.where(short > ROUNDING * np.abs(ordered_flow), short, 0.0).mean(axis=1)
         circularity[:, t], mean[:, t] = outcome.circularity, outcome.circularity_mean

@@ -12,12 +12,13 @@ from cirl_marl.compartments import CompartmentModel, model_class
 from cirl_marl.definitions.code_permission import refusal
 from cirl_marl.definitions.data_files import DataFiles
 from cirl_marl.definitions.error_messages import parameter_mistakes
-from cirl_marl.definitions.quantities import AmountColumn, AmountSeries, QuantityTable, Range
+from cirl_marl.definitions.quantities import AmountColumn, AmountSeries, QuantityTable, Range, RecordColumn
 from cirl_marl.definitions.schema import Batches, ModelTable, NetworkTable
 from cirl_marl.definitions.series_tables import Clock, column_value, inline_series, product
 from cirl_marl.errors import CirlError, NetworkError, unknown_name
 from cirl_marl.network import Network, elements
 from cirl_marl.network.declarations import Declaration, Numbers, Quantity, Subtable, declarations
+from cirl_marl.network.disturbances import KINDS, Correlation, DisturbanceEffect
 from cirl_marl.network.elements import LAW_FIELDS, Arc, Control, ControlKind, Law, Node
 from cirl_marl.network.series import Series, Value
 from cirl_marl.network.uncertainty import Spread
@@ -46,6 +47,7 @@ class Converter:
         self.mistakes: list[str] = []
         self.data_files: set[str] = set()
         self.uncertain: dict[str, Spread] = {}
+        self.disturbed: dict[str, DisturbanceEffect] = {}
         self._file_errors: set[str] = set()
         mass, time = table.units.mass, table.units.time
         self.targets = {"mass": mass, "time": time, "rate": f"1/({time})", "flow": f"({mass})/({time})", "steps": "1"}
@@ -80,7 +82,14 @@ class Converter:
             "episode": self._part(elements.Episode, table.episode, "episode"),
             "objective": self._part(elements.Objective, table.objective, "objective"),
             "observation": self._part(elements.Observation, table.observation, "observation"),
+            "disturbances": {
+                name: self._part(KINDS[entry.kind], entry, f"disturbances.{name}")
+                for name, entry in table.disturbances.items()
+            },
         }
+        if table.disturbance_correlation is not None:
+            correlation = self._part(Correlation, table.disturbance_correlation, "disturbance_correlation")
+            parts["correlation"] = correlation
         title, material = (self._with_region(getattr(table, key), key) for key in ("title", "material"))
         if self.mistakes:
             raise NetworkError(table.name, self.mistakes)
@@ -95,6 +104,7 @@ class Converter:
             data_sha256={name: self.files.sha256(name) for name in sorted({*self.data_files, *self.files.plain_files})},
             default_agents=tuple(table.agents),
             uncertain=self.uncertain,
+            disturbed=self.disturbed,
             **parts,
             **fields,
         )
@@ -138,7 +148,22 @@ class Converter:
             return stock, stock
         if isinstance(entry, Batches):
             return self._batches(entry, path)
+        if isinstance(entry, RecordColumn):
+            return self._record(entry, path)
+        if isinstance(declaration, Numbers) and declaration.table_form == "matrix":
+            return tuple(map(tuple, entry))
         return tuple(entry) if isinstance(entry, list) else entry
+
+    def _record(self, entry: RecordColumn, path: str) -> tuple[float, ...]:
+        """Return the numbers of a column of a file as they stand there."""
+        texts = {key: self._with_region(text, f"{path}.where.{key}") for key, text in entry.where.items()}
+        try:
+            column = self.files.column(entry.file, entry.column, texts, entry.times)
+        except CirlError as error:
+            self.mistakes.append(f"{path}: {error}")
+            return ()
+        self.data_files.add(entry.file)
+        return tuple(column.values)
 
     def _compartment(self, record: type[Node] | type[Arc], id_: str, table: Any, path: str) -> Any:
         """Return a node or an arc, whose control depends on its model, with the scale of all that state none."""
@@ -242,6 +267,7 @@ class Converter:
         unit = self._factor(name, kind, path)
         value = self._in_time(quantity, unit, path)
         self._spread(quantity, value, unit, path)
+        self._disturb(quantity, name, kind, path)
         if multiplier is None:
             return value
         return product(value, self._in_time(multiplier, 1.0, f"{path}.multiplied_by"))
@@ -268,6 +294,23 @@ class Converter:
             return
         kind = quantity.distribution or ("uniform" if deviation is None else "normal")
         self.uncertain[path] = Spread(deviation=relative, low=low, high=high, distribution=kind)
+
+    def _disturb(self, quantity: Any, unit: str, kind: str, path: str) -> None:
+        """Note what disturbs a quantity, if anything does."""
+        name = quantity.disturbed_by
+        if name is None:
+            if quantity.disturbed_as is not None:
+                self.mistakes.append(
+                    f"{path}.disturbed_as: '{quantity.disturbed_as}' needs disturbed_by, a disturbance"
+                )
+            return
+        adds, scale, own = quantity.disturbed_as == "summand", 1.0, self.table.disturbances.get(name)
+        if adds and own is not None:
+            scale = self._factor(own.unit, kind, f"{path}.disturbed_by: '{name}', which is added")
+        elif own is not None and own.unit != "1":
+            remedy = f"a factor has unit '1'; or write disturbed_as = \"summand\", which adds it to the {unit}"
+            self.mistakes.append(f"{path}.disturbed_by: '{name}' has unit '{own.unit}': {remedy}")
+        self.disturbed[path] = DisturbanceEffect(by=name, adds=adds, scale=scale)
 
     def _in_time(self, entry: float | QuantityTable | AmountSeries | AmountColumn, unit: float, path: str) -> Value:
         """Return a number, or one that changes in time, in the network's units, of which its own is ``unit``."""
@@ -296,6 +339,8 @@ class Converter:
 
     def _factor(self, unit: str, kind: str, path: str) -> float:
         """Return what converts ``unit`` to the network's unit of a kind, or to the unit ``kind`` if it is none."""
+        if kind == "own":
+            return 1.0
         if (unit, kind) not in self.factors:
             try:
                 self.factors[unit, kind] = factor(unit, self.targets.get(kind, kind))

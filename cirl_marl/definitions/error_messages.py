@@ -11,7 +11,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from cirl_marl.definitions.quantities import FORMS, forms
+from cirl_marl.definitions.quantities import forms
 from cirl_marl.errors import unknown_name
 
 REQUIREMENTS = {
@@ -70,7 +70,7 @@ def _mistake(item: Mapping[str, Any], model: type[BaseModel]) -> str:
     path = "".join(
         f", entry {part + 1}" if isinstance(part, int) else f".{part}"
         for part in item["loc"]
-        if part not in ("[key]", *FORMS)
+        if part != "[key]" and not (isinstance(part, str) and part.startswith("<"))
     ).lstrip(".,")
     path = path or "file"
     if item["type"] == "extra_forbidden" and location[::2] == ["arcs", "series"]:
@@ -104,7 +104,7 @@ def _model_at(model: type[BaseModel], location: list[str]) -> type[BaseModel] | 
     """Return the model of the table at ``location``."""
     current: Any = model
     for part in location:
-        if part in FORMS:
+        if part.startswith("<"):
             current = forms(current)[part]
         elif isinstance(current, type) and issubclass(current, BaseModel):
             fields = {f.alias or name: f.annotation for name, f in current.model_fields.items()}

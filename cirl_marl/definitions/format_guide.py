@@ -26,6 +26,8 @@ PARTS: dict[str, tuple[Any, str]] = {
     "lifetime": (schema.LifetimeTable, "`lifetime` of a node"),
     "model": (schema.ModelTable, "`model` of a node or an arc"),
     "service": (schema.ServiceTable, "`[services.NAME]`"),
+    **{kind: (table, f'`[disturbances.NAME]` with `kind = "{kind}"`') for kind, table in schema.DISTURBANCES.items()},
+    "correlation": (schema.CorrelationTable, "`[disturbance_correlation]`"),
     "quantity": (quantities.QuantityTable, "Every number with a unit"),
     "series": (quantities.SeriesTable, "For a quantity; in a control without `unit` and `source`, which are its own"),
     "column": (quantities.ColumnTable, "For a quantity; in a control without `unit` and `source`, which are its own"),

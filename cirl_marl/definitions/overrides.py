@@ -24,10 +24,15 @@ def overlay(base: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, A
 
 
 def _takes_its_place(new: Mapping[str, Any], old: Mapping[str, Any]) -> bool:
-    """Whether a scenario's table replaces the old one whole: a quantity, or a model or control of another kind."""
+    """Whether a scenario's table replaces the old one whole: a quantity, or a model or control of another kind.
+
+    One that only says what disturbs a quantity leaves the quantity as it is.
+    """
     kind = old.get("kind")
     if isinstance(kind, str):
         return bool(new.get("kind", kind) != kind)
+    if new.keys() <= {"disturbed_by", "disturbed_as"}:
+        return False
     return any(isinstance(old.get(key), str | list) for key in ("source", "file", "times"))
 
 

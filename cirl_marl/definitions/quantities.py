@@ -57,6 +57,10 @@ class StatedTable(Table):
     distribution: Literal["normal", "lognormal", "gamma", "uniform"] | None = Field(
         None, description="of what it may be; default: ``normal`` with a deviation, else ``uniform``"
     )
+    disturbed_by: str | None = Field(None, description="name of a disturbance, whose value multiplies it in time")
+    disturbed_as: Literal["factor", "summand"] | None = Field(
+        None, description="``summand``: the disturbance is added instead, in its own unit; default: ``factor``"
+    )
 
 
 class QuantityTable(StatedTable):
@@ -134,6 +138,15 @@ class AmountColumn(Table):
     time_unit: TimeUnit = None
 
 
+class RecordColumn(Table):
+    """Numbers of a column of a CSV file, in the order of its rows and in the unit of the table in which they stand."""
+
+    file: str = Field(description="name of the file, which lies in the folder of the definition or below it")
+    column: str = Field(description="the column with the numbers")
+    where: dict[str, str] = Field({}, description="texts by which rows are chosen, by column, as of a quantity")
+    times: str | None = Field(None, description="the column with the times, likewise")
+
+
 class ColumnTable(AmountColumn, StatedTable):
     """A quantity that stands in a CSV file; the last step holds as long as the one before it."""
 
@@ -178,4 +191,8 @@ def forms(kind: Any) -> dict[str, Any]:
     return by_tag
 
 
+Record = Annotated[
+    Annotated[list[Number], Tag(VALUE)] | Annotated[RecordColumn, Tag(COLUMN)],
+    Discriminator(lambda entry: COLUMN if isinstance(entry, dict) else VALUE),
+]
 VaryingAmount = number_forms(Number, AmountSeries, AmountColumn)

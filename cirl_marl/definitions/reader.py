@@ -18,7 +18,6 @@ from cirl_marl.definitions.conversion import Converter
 from cirl_marl.definitions.data_files import DataFiles
 from cirl_marl.definitions.error_messages import choices, toml_mistake, validation_mistakes
 from cirl_marl.definitions.overrides import COMMON_KEYS, overlay, path_mistakes, without_paths
-from cirl_marl.definitions.quantities import FORMS
 from cirl_marl.definitions.region_copies import compose_copies, copied_file
 from cirl_marl.definitions.schema import NetworkTable
 from cirl_marl.errors import CirlError, DefinitionError, NetworkError, unknown_name
@@ -250,7 +249,7 @@ def _further_mistakes(
     """Look for mistakes behind the given ones, with misspelt values mended and unknown keys left out."""
     corrected_document = copy.deepcopy(dict(document))
     for item in error.errors():
-        *path, last = [part for part in item["loc"] if part not in ("[key]", *FORMS)]
+        *path, last = [part for part in item["loc"] if part != "[key]" and not str(part).startswith("<")]
         table: Any = corrected_document
         for part in path:
             table = table[part]

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from cirl_marl.definitions.error_messages import validation_mistakes
 from cirl_marl.definitions.overrides import overlay, path_mistakes, without_paths
-from cirl_marl.definitions.schema import CopiesTable
+from cirl_marl.definitions.schema import CopiesTable, CorrelationTable
 from cirl_marl.errors import NetworkError, unknown_name
 from cirl_marl.network.declarations import Kinds, Quantity, declarations
 from cirl_marl.network.elements import Arc, Node
@@ -20,6 +20,7 @@ NAME_KEYS: Mapping[str, tuple[str, ...]] = {
     "nodes": (),
     "arcs": ("from", "to", "by", "makes_up_for"),
     "services": ("provider", "also", "owed_by"),
+    "disturbances": ("observed_by",),
 }
 """The tables that are copied, and their keys that name nodes, arcs or services."""
 COMPARTMENTS = {"nodes": Node, "arcs": Arc}
@@ -64,7 +65,10 @@ def compose_copies(
         if region_id not in texts
     ]
     nodes: dict[str, tuple[str, ...]] = {}
-    for region in [] if mistakes else table.regions or texts:
+    regions = [] if mistakes else table.regions or [*texts]
+    if regions:
+        _add_common(document_, pattern, regions)
+    for region in regions:
         copy = _copy(pattern, region, str(texts[region]))
         for part in NAME_KEYS:
             entries, more = document_.setdefault(part, {}), copy.get(part, {})
@@ -77,14 +81,12 @@ def compose_copies(
     return document_, nodes
 
 
-def _table(entries: Any, path: str) -> Any:
-    """Return the table at ``path``; that of a scenario has neither ``of`` nor ``regions``."""
+def _table(entries: Any, path: str, kind: type[BaseModel] = CopiesTable) -> Any:
+    """Return the table at ``path``, as a ``kind`` of table; that of a scenario has neither ``of`` nor ``regions``."""
     try:
-        return CopiesTable.model_validate(entries)
+        return kind.model_validate(entries)
     except ValidationError as error:
-        raise NetworkError(
-            "copies", [f"{path}.{mistake}" for mistake in validation_mistakes(error, CopiesTable)]
-        ) from None
+        raise NetworkError("copies", [f"{path}.{mistake}" for mistake in validation_mistakes(error, kind)]) from None
 
 
 def _pattern(document: Document, original: Document, scenario: str) -> dict[str, Any]:
@@ -124,10 +126,37 @@ def _still(value: Any, key: str, removals: set[str]) -> Any:
 
 
 def _strangers(pattern: Document, change: Document, prefix: str) -> Iterator[str]:
-    for part in NAME_KEYS:
+    for part in (part for part in NAME_KEYS if part != "disturbances"):  # of which a scenario may bring new ones
         for id_ in change.get(part, {}):
             if id_ not in pattern.get(part, {}):
                 yield f"{prefix}{part}: {unknown_name(part[:-1], id_, pattern.get(part, {}))}"
+
+
+def _add_common(document: dict[str, Any], pattern: dict[str, Any], regions: Sequence[str]) -> None:
+    """Move disturbances that regions share from what is copied to ``document``, and write out what correlates them."""
+    own = pattern.get("disturbances", {})
+    common = {name: part for name, part in own.items() if isinstance(part, Mapping) and part.get("common") is True}
+    if own:
+        pattern["disturbances"] = {name: part for name, part in own.items() if name not in common}
+        document["disturbances"] = {**common, **document.get("disturbances", {})}
+    if (entries := pattern.pop("disturbance_correlation", None)) is None:
+        return
+    table: Any = _table(entries, "disturbance_correlation", CorrelationTable)
+    count, between = len(table.names), 0.0 if table.regions is None else table.regions.value
+    if len(table.matrix) != count or {*map(len, table.matrix)} != {count} or "disturbance_correlation" in document:
+        fault = (
+            f"needs a matrix of {count} rows of {count} numbers, and stands there or in the definition copied, not both"
+        )
+        raise NetworkError("copies", [f"disturbance_correlation: {fault}"])
+    places = [(region, i) for region in regions for i in range(count) if table.names[i] not in common]
+    places += [("", i) for i in range(count) if table.names[i] in common]
+    document["disturbance_correlation"] = {
+        "names": [f"{region}_{table.names[i]}".lstrip("_") for region, i in places],
+        "matrix": [
+            [table.matrix[i][j] * (1.0 if a == b or not a or not b else between) for b, j in places] for a, i in places
+        ],
+        "source": table.source,
+    }
 
 
 def _copy(pattern: Document, region: str, text: str) -> dict[str, Any]:
@@ -143,13 +172,24 @@ def _copy(pattern: Document, region: str, text: str) -> dict[str, Any]:
     for part, keys in NAME_KEYS.items():
         copy[part] = {}
         for id_, table in pattern.get(part, {}).items():
-            entries = _with_region(table, text)
+            entries = _with_disturbances(_with_region(table, text), region, pattern.get("disturbances", {}))
             entries |= {key: rename(entries[key]) for key in keys if key in entries}
-            entries["title"] = f"{text}: {entries.get('title', id_)}"
+            if part != "disturbances":
+                entries["title"] = f"{text}: {entries.get('title', id_)}"
             if part in COMPARTMENTS and "scale" not in entries:
                 entries["scale"] = _with_region(pattern["scales"][_scale(COMPARTMENTS[part], entries)], text)
             copy[part][f"{region}_{id_}"] = entries
     return copy
+
+
+def _with_disturbances(value: Any, region: str, disturbances: Document) -> Any:
+    """Return a copy of a table whose quantities are disturbed by what the region has of these ``disturbances``."""
+    if not isinstance(value, Mapping):
+        return value
+    table = {key: _with_disturbances(entry, region, disturbances) for key, entry in value.items()}
+    if table.get("disturbed_by") in disturbances:
+        table["disturbed_by"] = f"{region}_{table['disturbed_by']}"
+    return table
 
 
 def _with_region(value: Any, text: str) -> Any:

@@ -6,15 +6,17 @@ what files spell otherwise than Python is written out here.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_type_hints
 
-from pydantic import Field, StrictBool, create_model
+from pydantic import BaseModel, Discriminator, Field, StrictBool, Tag, create_model
+from pydantic.json_schema import SkipJsonSchema
 
 from cirl_marl.definitions.quantities import (
     ColumnTable,
     Number,
     QuantityTable,
     Range,
+    Record,
     SeriesTable,
     Source,
     Table,
@@ -33,6 +35,7 @@ from cirl_marl.network.declarations import (
     default_of,
     is_required,
 )
+from cirl_marl.network.disturbances import KINDS, Correlation
 from cirl_marl.network.elements import (
     IDENTIFIER,
     Arc,
@@ -122,7 +125,14 @@ def _field_type(declaration: Declaration, hint: Any) -> Any:
     if isinstance(declaration, Word):
         return declaration.of if isinstance(declaration.of, type) else Literal[declaration.of]
     if isinstance(declaration, Numbers):
-        tables = {"range": number_forms(Range, None, ColumnTable), "batches": Batches, "amount": VaryingAmount}
+        tables: dict[str, Any] = {
+            "range": number_forms(Range, None, ColumnTable),
+            "batches": Batches,
+            "amount": VaryingAmount,
+            "list": list[Number],
+            "matrix": list[list[Number]],
+            "record": Record,
+        }
         return tables[declaration.table_form] if declaration.table_form else None
     if isinstance(declaration, Subtable):
         return {"control": ControlTable, "lifetime": LifetimeTable, "model": ModelTable}[declaration.of]
@@ -139,6 +149,13 @@ def _field_type(declaration: Declaration, hint: Any) -> Any:
     return {bool: StrictBool, tuple[str, ...]: list[str]}.get(hint, hint)
 
 
+def _disturbance_table(kind: str) -> Any:
+    """Return the table of a kind of disturbance, which says its kind."""
+    word = Field(description=f"``{kind}``; other kinds: {', '.join(other for other in KINDS if other != kind)}")
+    unit = Field(description=declarations(KINDS[kind])["unit"].meaning)
+    return table_of(KINDS[kind], kind=(Literal[kind], word), unit=(str, unit), source=(Source, ...))
+
+
 FixedQuantity = number_forms(QuantityTable, None, ColumnTable)
 ControlTable = table_of(Control)
 LifetimeTable = table_of(Lifetime)
@@ -148,6 +165,25 @@ ServiceTable = table_of(Service)
 EpisodeTable = table_of(Episode)
 ObjectiveTable = table_of(Objective)
 ObservationTable = table_of(Observation)
+DISTURBANCES: dict[str, Any] = {kind: _disturbance_table(kind) for kind in KINDS}
+"""The table of each kind of disturbance."""
+CorrelationTable = table_of(Correlation, source=(Source, ...))
+
+
+class NoKind(BaseModel):
+    """A disturbance that says none of the kinds there are."""
+
+    kind: Literal[tuple(KINDS)]  # type: ignore[valid-type]
+
+
+def _disturbance_kind(entry: Any) -> str:
+    kind = entry.get("kind") if isinstance(entry, dict) else None
+    return f"<{kind}>" if kind in KINDS else "<kind>"
+
+
+_BY_KIND = {**DISTURBANCES, "kind": SkipJsonSchema[NoKind]}
+_KIND_TABLES = [Annotated[table, Tag(f"<{kind}>")] for kind, table in _BY_KIND.items()]
+DisturbanceTable = Annotated[Union[*_KIND_TABLES], Discriminator(_disturbance_kind)]  # type: ignore[valid-type]
 
 
 class UnitsTable(Table):
@@ -177,6 +213,7 @@ class CopiesTable(Table):
     nodes: Changes = Field(description="tables laid over those of each copy, key by key, as in scenarios")
     arcs: Changes = Field(description="likewise; ends that are no node of the copy are nodes of this definition")
     services: Changes = Field(description="likewise")
+    disturbances: Changes = Field(description="likewise, or new ones; those that are ``common`` stand in no copy")
 
 
 class NetworkTable(Table):
@@ -204,6 +241,12 @@ class NetworkTable(Table):
     nodes: dict[Identifier, NodeTable]  # type: ignore[valid-type]
     arcs: dict[Identifier, ArcTable]  # type: ignore[valid-type]
     services: dict[Identifier, ServiceTable] = Field({})  # type: ignore[valid-type]
+    disturbances: dict[Identifier, DisturbanceTable] = Field(
+        {}, description="processes in time that disturb the quantities that name them in ``disturbed_by``"
+    )
+    disturbance_correlation: CorrelationTable | None = Field(  # type: ignore[valid-type]
+        None, description="what correlates them; left out, they are independent"
+    )
     scenarios: dict[Identifier, dict[str, Any]] = Field(
         {},
         description="tables that replace those of the default scenario, key by key, after those named in 'without', "

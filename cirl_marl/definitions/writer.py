@@ -25,6 +25,7 @@ from cirl_marl.network.declarations import (
     default_of,
     is_required,
 )
+from cirl_marl.network.disturbances import KINDS, Disturbance
 from cirl_marl.network.elements import Arc, Compartment, Control, ControlKind, Law
 from cirl_marl.network.series import Series, Value
 from cirl_marl.network.uncertainty import Spread
@@ -57,7 +58,7 @@ def _toml_tables(document: dict[str, Any]) -> tomlkit.TOMLDocument:
     """Lay settings and compartments out as tables with a line for each key."""
     layout = tomlkit.document()
     for key, value in document.items():
-        if key in ("nodes", "arcs", "services") and value:
+        if key in ("nodes", "arcs", "services", "disturbances") and value:
             layout[key] = tomlkit.table(is_super_table=True)
             for id_, part in value.items():
                 layout[key][id_] = _fill_table(tomlkit.table(), part)
@@ -98,7 +99,28 @@ class _Writer:
                 key: {part.id: self._part(part, f"{key}.{part.id}") for part in getattr(network, key)}
                 for key in ("nodes", "arcs", "services")
             },
+            **self._disturbances(),
         }
+
+    def _disturbances(self) -> dict[str, Any]:
+        """Return the tables of what disturbs it, if anything does."""
+        network = self._network
+        tables: dict[str, Any] = {}
+        if network.disturbances:
+            tables["disturbances"] = {
+                name: {"kind": _kind(part), **self._part(part), "unit": part.unit, "source": SOURCE}
+                for name, part in network.disturbances.items()
+            }
+        if network.correlation is not None:
+            tables["disturbance_correlation"] = {**self._part(network.correlation), "source": SOURCE}
+        return tables
+
+    def _disturbance_keys(self, path: str) -> dict[str, Any]:
+        """Return the keys that say what disturbs a number."""
+        disturbed = self._network.disturbed.get(path)
+        if disturbed is None:
+            return {}
+        return {"disturbed_by": disturbed.by, **({"disturbed_as": "summand"} if disturbed.adds else {})}
 
     def _part(self, part: Any, path: str = "") -> dict[str, Any]:
         """Return the table of a part, without what is as it is by default; ``path`` is its path."""
@@ -106,16 +128,18 @@ class _Writer:
         for name, declaration in declarations(type(part)).items():
             value, key = getattr(part, name), declaration.key or name
             must_write = is_required(type(part), name) or name == _law_field(part)
-            must_write = must_write or f"{path}.{name}" in self._network.uncertain
+            must_write = must_write or f"{path}.{name}" in {**self._network.uncertain, **self._network.disturbed}
             if not must_write and value == default_of(type(part), name):
                 continue
             if isinstance(declaration, CalendarTime):
                 table[key] = value if isinstance(value, date) else float(value)
             elif isinstance(declaration, Quantity) and declaration.unit_of_table:
-                table |= {key: float(value), "unit": self._units[declaration.kind(part)], "source": SOURCE}
+                unit_ = self._units.get(declaration.kind(part)) or part.unit
+                table |= {key: float(value), "unit": unit_, "source": SOURCE}
             elif isinstance(declaration, Quantity):
                 spread = self._network.uncertain.get(f"{path}.{name}")
                 table[key] = self._quantity(value, declaration.kind(part)) | _spread_keys(spread, value)
+                table[key] |= self._disturbance_keys(f"{path}.{name}")
             elif isinstance(declaration, Numbers):
                 unit = {"unit": self._units.get(declaration.of, "1"), "source": SOURCE}
                 if declaration.table_form == "range":
@@ -123,13 +147,17 @@ class _Writer:
                 elif declaration.table_form == "batches":
                     times, masses = ([float(pair[column]) for pair in value] for column in (0, 1))
                     table[key] = {"times": times, "masses": masses, "time_unit": self._units["time"], **unit}
+                elif declaration.table_form in ("list", "record"):
+                    table[key] = [*map(float, value)]
+                elif declaration.table_form == "matrix":
+                    table[key] = [[*map(float, row)] for row in value]
             elif isinstance(declaration, Subtable):
                 write = {"control": self._control, "model": self._model}.get(declaration.of)
                 table[key] = write(part) if write else self._part(value)
             elif isinstance(value, tuple):
                 table[key] = list(value)
             else:
-                table[key] = value if isinstance(value, bool) else str(value)
+                table[key] = value if isinstance(value, bool | int) else str(value)
         table.pop("reward_scale", None)  # it stands in the table of the model
         return table
 
@@ -190,6 +218,10 @@ def _spread_keys(spread: Spread | None, value: Value) -> dict[str, Any]:
     if math.isfinite(spread.high):
         entries["range"] = [spread.low * middle, spread.high * middle]
     return entries
+
+
+def _kind(disturbance: Disturbance) -> str:
+    return next(kind for kind, record in KINDS.items() if type(disturbance) is record)
 
 
 def _law_field(part: Any) -> str:

@@ -22,7 +22,7 @@ from cirl_marl.dynamics.routing import Routing
 from cirl_marl.dynamics.shares import Shares
 from cirl_marl.dynamics.stages import StagedNetwork, simulated_network
 from cirl_marl.dynamics.state_layout import StateLayout
-from cirl_marl.dynamics.uncertain_factors import FlowFactors
+from cirl_marl.dynamics.uncertain_factors import FlowFactors, IntervalFactors
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import positional_record
@@ -207,6 +207,7 @@ class FlowLaws(ArcRates):
     """Drivers, rates and controls of every arc; with ``uncertain``, of copies with draws of the uncertain numbers.
 
     Attributes:
+        factors: on numbers that are uncertain or disturbed.
         network: whose laws they are; arcs of ``staged_network`` begin with its own.
         incidence: S with empty rows for batches and unit, shape (masses, arcs).
         time_dependent: arcs whose r depends on the interval, by id.
@@ -217,14 +218,16 @@ class FlowLaws(ArcRates):
     def __init__(self, network: Network, *, uncertain: bool = False) -> None:
         """Compile ``network``."""
         staged_network = simulated_network(network)
-        self._factors = FlowFactors(staged_network) if uncertain else None
+        self.factors = IntervalFactors(network, uncertain=uncertain)
+        ranges = self.factors.ranges
+        self._factors = FlowFactors(staged_network, ranges) if ranges else None
         super().__init__(staged_network, self._factors)
         self.network, rows, arcs = network, self.rows, len(staged_network.arcs)
         ends = np.concatenate([staged_network.donors, staged_network.recipients])
         has_stock, arcs_twice = ends < rows.nodes.stop, np.tile(np.arange(arcs), 2)
         signs = np.repeat([-1.0, 1.0], arcs)
         self.incidence = RowSum(ends[has_stock], arcs_twice[has_stock], signs[has_stock], (rows.masses, arcs))
-        self._shares = Shares(staged_network, uncertain=uncertain)
+        self._shares = Shares(staged_network, ranges)
         self.max_rate[self._shares.arcs] *= self._shares.highest
         time_arcs = [*self._series_arcs, *(self._shares.varying_arcs if self._shares.is_time_varying else ())]
         self.time_dependent = tuple(staged_network.arcs[k].id for k in time_arcs)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -25,9 +25,9 @@ class Shares:
         changing: whether a share may differ from interval to interval though controls are the same.
     """
 
-    def __init__(self, network: Network, *, uncertain: bool = False) -> None:
-        """Compile the splits of ``network``; with ``uncertain``, those of which a share is uncertain vary."""
-        numbers = numbers_of(network, "arcs", "share") if uncertain else {}
+    def __init__(self, network: Network, ranges: Mapping[str, tuple[float, float]]) -> None:
+        """Compile the splits of ``network``; those of which a share is in ``ranges``, of factors, vary."""
+        numbers = numbers_of(ranges, "arcs", "share")
         number_of = {network.arc_index[id_]: number for id_, number in numbers.items()}
         all_splits = network.splits
         tables = [(single_column(split.bounds), single_column(split.proportions)) for split in all_splits]
@@ -75,7 +75,7 @@ class Shares:
         self._factors = RowFactors({n: number_of[k] for n, (_, k) in enumerate(free_exits) if k in number_of})
         proportions = self._proportions
         if number_of:
-            ends = np.array([spread.ends for spread in network.uncertain.values()]).T
+            ends = np.array([*ranges.values()]).T
             proportions = self._most(ends)
         highest = np.concatenate([high, proportions * self._room[self._of_others]]).max(axis=1)
         self.highest = np.concatenate([highest, self.values[:, 0]])

@@ -66,7 +66,7 @@ class Supply:
         self._weights = np.array(weights).reshape(-1, 1)
         demand = [network.interval_means(service.low) for service in services]
         self._demand = np.array(demand).reshape(len(services), network.episode.horizon)
-        numbers = numbers_of(network, "services", "low")
+        numbers = numbers_of(dynamics.factors.ranges, "services", "low")
         self._factors = RowFactors(
             {row: numbers[service_.id] for row, service_ in enumerate(services) if service_.id in numbers}
         )

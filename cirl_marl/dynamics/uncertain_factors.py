@@ -1,6 +1,7 @@
-"""What factors on uncertain numbers act on: the flows of arcs, or rows of a table such as the bands of services.
+"""Factors on numbers that are not certain, and what they act on: flows of arcs, or rows of a table such as bands.
 
-Factors have shape (numbers, B), a row for each of ``Network.uncertain``: every copy has a draw of its own.
+Factors have shape (numbers, B): every copy has its own. They are what an episode drew, times or plus what disturbs it
+in the interval.
 """
 
 from __future__ import annotations
@@ -12,7 +13,61 @@ import numpy as np
 from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import Law
-from cirl_marl.network.uncertainty import numbers_of
+from cirl_marl.network.uncertainty import factor_ranges, numbers_of, stated_means
+
+
+class IntervalFactors:
+    """Factors on all numbers that are not certain.
+
+    Attributes:
+        ranges: lowest and highest factor by path; the rows of factors.
+    """
+
+    def __init__(self, network: Network, *, uncertain: bool) -> None:
+        """Take the disturbed numbers of a network, and with ``uncertain`` those that episodes draw."""
+        self.ranges = factor_ranges(network, with_draws=uncertain)
+        self._draws = len(network.uncertain) if uncertain else 0
+        rows = {path: row for row, path in enumerate(self.ranges)}
+        index = network.processes.names.index
+        self._times: list[tuple[int, int]] = []
+        self._added: list[tuple[int, int, Floats]] = []
+        for path, disturbed in network.disturbed.items():
+            if disturbed.adds:
+                self._added.append((rows[path], index(disturbed.by), disturbed.scale / stated_means(network, path)))
+            else:
+                self._times.append((rows[path], index(disturbed.by)))
+        only_times = not self._draws and not self._added
+        names: Integers = np.array([name for _, name in self._times], dtype=np.intp)
+        self._alone = names if only_times else None
+        self._last = network.episode.horizon - 1
+
+    def __call__(self, draws: Floats, values: Floats, step: Integers) -> Floats | None:
+        """Return the factors in an interval of each copy, shape (numbers, B); None if everything is certain.
+
+        Args:
+            draws: of the episode, shape (numbers drawn, B).
+            values: ξ in all intervals, shape (intervals, names, B).
+            step: the interval in each copy, shape (B,).
+        """
+        if not self.ranges:
+            return None
+        if not self._times and not self._added:
+            return draws
+        first = step.item(0)
+        if (step == first).all():
+            now = values[first]
+        else:
+            now = np.ascontiguousarray(values[step, :, np.arange(len(step))].T)
+        if self._alone is not None:
+            alone: Floats = now.take(self._alone, axis=0)
+            return alone
+        factors = np.ones((len(self.ranges), len(step)))
+        factors[: self._draws] = draws
+        for row, name in self._times:
+            factors[row] *= now[name]
+        for row, name, part in self._added:
+            factors[row] += now[name] * part.take(np.minimum(step, self._last))
+        return factors
 
 
 class RowFactors:
@@ -44,11 +99,11 @@ class FlowFactors:
         highest: greatest factor on each, shape (arcs,).
     """
 
-    def __init__(self, network: Network) -> None:
-        """Find them in ``network``, which has its lifetimes as stages if it has any."""
+    def __init__(self, network: Network, ranges: Mapping[str, tuple[float, float]]) -> None:
+        """Find them in ``network``, which has its lifetimes as stages if it has any; ``ranges`` are of all factors."""
         valves = network.valves if isinstance(network, StagedNetwork) else {}
-        rates, flows = numbers_of(network, "arcs", "rate"), numbers_of(network, "arcs", "flow")
-        releases, stretches = numbers_of(network, "nodes", "rate"), numbers_of(network, "nodes", "stretch")
+        rates, flows = numbers_of(ranges, "arcs", "rate"), numbers_of(ranges, "arcs", "flow")
+        releases, stretches = numbers_of(ranges, "nodes", "rate"), numbers_of(ranges, "nodes", "stretch")
         entries: list[tuple[int, int, bool]] = []
         for k, arc in enumerate(network.arcs):
             if arc.donor in valves:
@@ -62,7 +117,7 @@ class FlowFactors:
         self.arcs: Integers = np.array([k for k, _, _ in entries], dtype=np.intp)
         self._numbers: Integers = np.array([number for _, number, _ in entries], dtype=np.intp)
         self._inverse_rows: Integers = np.flatnonzero([inverse for _, _, inverse in entries])
-        ends = [spread.ends for spread in network.uncertain.values()]
+        ends = [*ranges.values()]
         extremes = [1 / ends[number][0] if inverse else ends[number][1] for _, number, inverse in entries]
         self.highest: Floats = np.array(extremes, dtype=float)
 

@@ -117,8 +117,7 @@ class JointVectorEnv(gymnasium.vector.VectorEnv[JointObservation, JointObservati
         """Start an episode in every copy; arguments are those of ``MultiAgentVectorEnv.reset``."""
         observations = self.batch.reset(seed, options)
         super().reset(seed=int(seed) if isinstance(seed, int | np.integer) else None)
-        self._over, factors = False, self.batch.physical.factors_if_any
-        infos = {} if factors is None else {"drawn": factors.T}
+        self._over, infos = False, self.batch.drawn_info(self.batch.physical.step)
         return np.ascontiguousarray(np.concatenate([*observations.values()], axis=1)), infos
 
     def step(

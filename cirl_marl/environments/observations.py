@@ -12,11 +12,12 @@ from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import OBSERVE, Arc
+from cirl_marl.network.processes import DisturbanceProcesses
 from cirl_marl.network.rowsum import spans
 
 
 class Signals:
-    """Rows of the signal table: quantities, time, service levels, set-points of nodes and arcs.
+    """Rows of the signal table: quantities, time, service levels, set-points of nodes and arcs, disturbances.
 
     The quantities are stocks, throughputs of nodes without stock, flows, inner states, measures and masses on the way
     along batch arcs. All but inner states and measures, and the set-points, are divided by the scale of their
@@ -26,6 +27,7 @@ class Signals:
         quantities: number of quantities.
         time: row of the time.
         rows: number of rows.
+        sights: what disturbances show, the last rows.
     """
 
     def __init__(self, dynamics: Dynamics) -> None:
@@ -35,8 +37,71 @@ class Signals:
         parts = spans((nodes, arcs, len(inner.names), len(inner.measure_names), lines, 1, services, nodes + arcs))
         self.nodes, self.flows, self.states, self.measures, self.loads, time, self.levels, self.set_points = parts
         self.stocks, self.throughputs = slice(0, len(network.stores)), slice(len(network.stores), nodes)
-        self.quantities, self.time, self.rows = self.loads.stop, time.start, self.set_points.stop
+        self.sights = Sights(network.processes)
+        self.seen = slice(self.set_points.stop, self.set_points.stop + len(self.sights.names))
+        self.quantities, self.time, self.rows = self.loads.stop, time.start, self.seen.stop
         self.inside = self.quantities > self.flows.stop  # whether there are quantities besides stocks and flows
+
+
+class Sights:
+    """What the disturbances of a network show of themselves, each value in parts of its largest size.
+
+    Attributes:
+        names: of the rows: values of the coming interval, or of an earlier one, and conditional means of later ones.
+        rows: of each disturbance, with who sees them; nobody in particular: all agents.
+        low: lowest values, shape (rows, 1).
+        high: highest values.
+    """
+
+    def __init__(self, processes: DisturbanceProcesses) -> None:
+        """Lay out the rows of disturbances that are not hidden."""
+        self._processes, names = processes, list[str]()
+        self.rows: list[tuple[range, tuple[str, ...]]] = []
+        self._parts: list[tuple[range, int, int, int]] = []
+        self._prior = processes.prior_means(1)[0]
+        size: list[tuple[float, float]] = []
+        for n, (name, part) in enumerate(zip(processes.names, processes.disturbances, strict=True)):
+            if part.observed == "none":
+                continue
+            ago = f" {part.delayed} intervals ago" if part.delayed else ""
+            rows = range(len(names), len(names) + 1 + part.forecast)
+            names.append(f"disturbance {name}{ago}")
+            names += (f"forecast of {name} in {k} intervals" for k in range(1, part.forecast + 1))
+            self.rows.append((rows, part.observed_by))
+            self._parts.append((rows, n, part.delayed, part.forecast))
+            size += [part.ends] * len(rows)
+        self.names, ends = tuple(names), np.array(size).reshape(-1, 2)
+        largest = np.abs(ends).max(axis=1, initial=np.finfo(float).tiny, keepdims=True)
+        self._inverse_size, (self.low, self.high) = 1.0 / largest, (ends / largest).T[..., None]
+        self._ahead = max((forecast for *_, forecast in self._parts), default=0)
+
+    def __bool__(self) -> bool:
+        """Whether there is anything to be seen."""
+        return bool(self.names)
+
+    def see(self, states: Floats, values: Floats, step: Integers) -> Floats:
+        """Return what is seen before an interval of each copy, shape (rows, B).
+
+        What is delayed shows, before the first value is known, the mean with which it starts.
+
+        Args:
+            states: of the processes in all intervals, shape (intervals, names, B).
+            values: likewise.
+            step: the coming interval of each copy, shape (B,).
+        """
+        sight = np.empty((len(self.names), len(step)))
+        copies = np.arange(len(step))
+        for rows, n, delay, _ in self._parts:
+            past = step - delay
+            sight[rows.start] = np.where(past < 0, self._prior[n], values[np.maximum(past, 0), n, copies])
+        if self._ahead:
+            for t in np.unique(step).tolist():
+                of = copies[step == t]
+                means = self._processes.conditional_means(np.ascontiguousarray(states[t][:, of]), t, self._ahead)
+                for rows, n, _, forecast in self._parts:
+                    sight[rows.start + 1 : rows.stop, of] = means[:forecast, n]
+        sight *= self._inverse_size
+        return sight
 
 
 class ObservationLayout:
@@ -48,6 +113,7 @@ class ObservationLayout:
         array_order: stocks and inner states in the order in which all agents observe them and nothing else; empty if
             they see other things too, or different ones.
         spaces: observation space of each agent; float32.
+        sights: what disturbances show.
     """
 
     def __init__(self, dynamics: Dynamics, agents: Sequence[str], mode: str | None, batch: int) -> None:
@@ -63,6 +129,7 @@ class ObservationLayout:
                 raise CirlError(f"observe: mode 'model' needs a model, and '{agent}' of '{network.name}' has none")
         inner, batches = dynamics.inner, dynamics.batches
         self.signals = signals = Signals(dynamics)
+        self.sights = signals.sights
         first = signals.states.start
         self._inner = {owner: [first + row for row in rows] for owner, rows in inner.observed_rows.items()}
         self._measures = inner.measure_names
@@ -97,17 +164,21 @@ class ObservationLayout:
         self._table = np.zeros((signals.rows, batch), dtype=np.float32)
         self._table[signals.set_points] = set_points[:, None]
 
-    def observe(self, quantities: Floats, time: Floats, levels: Floats) -> NDArray[np.float32]:
+    def observe(
+        self, quantities: Floats, time: Floats, levels: Floats, sight: Floats | None = None
+    ) -> NDArray[np.float32]:
         """Return the stacked observation, shape (entries of all agents, B).
 
         It follows from the quantities of ``Signals``, shape (quantities, B), the elapsed share of the episode, shape
-        (B,), and the service levels, shape (services, B).
+        (B,), the service levels, shape (services, B), and what is seen of disturbances (``Sights.see``).
         """
         table = self._table
         with np.errstate(over="ignore"):
             np.multiply(quantities, self._inverse_scale, out=table[: self.signals.quantities], casting="same_kind")
         table[self.signals.time] = time
         table[self.signals.levels] = levels
+        if sight is not None:
+            table[self.signals.seen] = sight
         return table.take(self._index, axis=0)
 
     def _common_order(self, agents: Sequence[str], mode: str) -> tuple[str, ...]:
@@ -156,6 +227,9 @@ class ObservationLayout:
         if mode == "full":
             yield from range(signals.levels.start, signals.levels.stop)
         yield from self._debts.get(agent, [])
+        for rows, agents in self.sights.rows:
+            if not agents or agent in agents:
+                yield from (signals.seen.start + row for row in rows)
         yield signals.time
 
     def _across(self, node: int) -> list[int]:
@@ -172,6 +246,7 @@ class ObservationLayout:
         yield "time"
         yield from (f"service level of {service.id}" for service in network.services)
         yield from (f"set-point of {id_}" for id_ in network.compartments)
+        yield from self.sights.names
 
     def _bounds(self, dynamics: Dynamics) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Bounds that conservation gives: no stock exceeds all the mass there is, no flow what that mass can drive."""
@@ -200,6 +275,7 @@ class ObservationLayout:
         low[signals.loads] = 0.0
         set_points = np.abs([c.set_point or 0.0 for c in compartments]) / scales
         low[signals.set_points], high[signals.set_points] = -set_points - 1, set_points + 1
+        low[signals.seen], high[signals.seen] = self.sights.low[:, 0] - 1e-6, self.sights.high[:, 0] + 1e-6
         return low.astype(np.float32), high.astype(np.float32)
 
 

@@ -103,8 +103,8 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         self.agents = list(self.possible_agents)
         if self.render_mode == "human":
             self.render()
-        factors = self.batch.physical.factors_if_any
-        infos: Infos = {agent: {} if factors is None else {"drawn": factors[:, 0]} for agent in self.agents}
+        drawn = first_copy(self.batch.drawn_info(self.batch.physical.step))
+        infos: Infos = {agent: dict(drawn) for agent in self.agents}
         return first_copy(observations), infos
 
     def step(

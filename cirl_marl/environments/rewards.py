@@ -38,8 +38,9 @@ class Scoring:
     Args of all methods are compartment-major, shape (rows, B).
     """
 
-    def __init__(self, network: Network, layout: ObservationLayout, agents: Sequence[str], batch: int) -> None:
+    def __init__(self, dynamics: Dynamics, layout: ObservationLayout, agents: Sequence[str], batch: int) -> None:
         """Compile the scores of ``agents`` and of the network as a whole, for arrays of ``batch`` columns."""
+        network, ranges = dynamics.network, dynamics.factors.ranges
         compartments = list(network.compartments.values())
         position = {c.id: i for i, c in enumerate(compartments)}
         tracked_ids = network.objective.tracked or [c.id for c in compartments if c.set_point is not None]
@@ -58,7 +59,7 @@ class Scoring:
         self._low, self._high = (band.reshape(len(services), width) for band in bands)
         self._factors = [
             RowFactors({row: numbers[s.id] for row, s in enumerate(services) if s.id in numbers})
-            for numbers in (numbers_of(network, "services", end) for end in ("low", "high"))
+            for numbers in (numbers_of(ranges, "services", end) for end in ("low", "high"))
         ]
         self._has_high = bool(np.isfinite(self._high).any())
         with_model = [position[c.id] for c in compartments if c.model is not None]
@@ -83,7 +84,7 @@ class Scoring:
     def levels(self, quantities: Floats, step: Integers, factors: Floats | None = None) -> Floats:
         """Return the level of each service in [0, 1], shape (services, B), in the interval ``step`` of each copy.
 
-        ``factors`` are those on the uncertain numbers, shape (numbers, B), if any were drawn.
+        ``factors`` are those on the numbers that are not certain, in that interval, shape (numbers, B), if any.
         """
         quantity = self._measure(quantities)
         low, high = self._low, self._high
@@ -250,7 +251,8 @@ class Credit:
             counterfactual[rows, columns] = neutral[rows]
             idle[[arc == agent for arc in self._supply.arcs], columns] = True
         stock, inner, step = np.tile(state.stock, count), np.tile(state.inner, count), np.tile(state.step, count)
-        factors = None if state.factors_if_any is None else np.tile(state.factors, count)
+        factors = dynamics.factors(state.factors, state.disturbances, state.step)
+        factors = None if factors is None else np.tile(factors, count)
         counterfactual = self._supply(stock, inner, counterfactual, step, idle, factors)
         transition = dynamics.advance(stock, inner, counterfactual, step, factors)
         flow = transition.moved_mass / dynamics.network.episode.control_interval

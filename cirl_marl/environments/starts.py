@@ -1,4 +1,4 @@
-"""Where episodes start: drawn from one random stream per copy, or given by the caller."""
+"""Where episodes start: drawn from one random stream per copy, or given by the caller; and what will disturb them."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from cirl_marl.errors import ControlError, unknown_name
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.compartment_model import DiscreteTimeModel, GoalTask
 from cirl_marl.network.initial_ages import age_shares
+from cirl_marl.network.processes import Paths, disturbance_stream
 
 
 class Starts:
@@ -23,6 +24,7 @@ class Starts:
         names: nodes, ``node.stage_i`` of those with a lifetime, then ``compartment.state`` of the inner states; the
             rows of every array here.
         streams: one generator per copy.
+        disturbance_streams: another one, if something is disturbed; starts are the same without it.
     """
 
     def __init__(self, network: Network, dynamics: Dynamics, num_envs: int, order: Sequence[str]) -> None:
@@ -33,6 +35,8 @@ class Starts:
         rows, inner = dynamics.rows, dynamics.inner
         self.names = rows.start_names
         self.streams = [np.random.default_rng() for _ in range(num_envs)]
+        self.processes = network.processes
+        self.disturbance_streams = self._disturbance_streams([None] * num_envs)
         self._network, self._bounds, self._wholes = network, _bounds(network), _wholes(network)
         self._rows = {name: np.array([row]) for row, name in enumerate(self.names)}
         self._stages = {network.stores[i].id: stages for i, stages in rows.stages.items()}
@@ -51,10 +55,12 @@ class Starts:
 
     def begin(self, seed: int | Sequence[int] | None, options: Mapping[str, Any] | None) -> Floats:
         """Return the state in which every copy starts, shape (rows, B); see ``MultiAgentVectorEnv.reset``."""
-        streams = self.streams if seed is None else self._new_streams(seed)
+        seeds = None if seed is None else self._seeds(seed)
         initial_state = self._initial_state({} if options is None else options)
-        self.streams = streams  # not before, so that what is refused changes nothing
-        start = self.draw(range(len(streams)))
+        if seeds is not None:  # not before, so that what is refused changes nothing
+            self.streams = [np.random.default_rng(s) for s in seeds]
+            self.disturbance_streams = self._disturbance_streams(seeds)
+        start = self.draw(range(len(self.streams)))
         for rows in self._stages.values():
             if any(self.names[row] in initial_state for row in rows):
                 start[rows] = 0.0  # stages that are not given are empty
@@ -92,16 +98,24 @@ class Starts:
         factors = [spread.at(share) for spread, share in zip(self._spreads, shares, strict=True)]
         return np.array(factors).reshape(shares.shape)
 
+    def paths(self, copies: range | Integers) -> Paths:
+        """Draw what will disturb an episode in some copies, each from its own stream."""
+        return self.processes.paths([self.disturbance_streams[i] for i in copies] if self.disturbance_streams else ())
+
     def saved_streams(self) -> tuple[Mapping[str, Any], ...]:
         """Return a copy of the state of every stream."""
-        return tuple(copy.deepcopy(dict(stream.bit_generator.state)) for stream in self.streams)
+        streams = (*self.streams, *self.disturbance_streams)
+        return tuple(copy.deepcopy(dict(stream.bit_generator.state)) for stream in streams)
 
     def restore_streams(self, states: Sequence[Mapping[str, Any]]) -> None:
         """Put every stream back."""
-        for stream, state in zip(self.streams, states, strict=True):
+        for stream, state in zip((*self.streams, *self.disturbance_streams), states, strict=True):
             stream.bit_generator.state = copy.deepcopy(dict(state))
 
-    def _new_streams(self, seed: int | Sequence[int]) -> list[np.random.Generator]:
+    def _disturbance_streams(self, seeds: Sequence[int | None]) -> list[np.random.Generator]:
+        return [disturbance_stream(seed) for seed in seeds] if self.processes.names else []
+
+    def _seeds(self, seed: int | Sequence[int]) -> list[int]:
         copies = len(self.streams)
         if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
             seeds = [int(seed) + i for i in range(copies)]
@@ -110,7 +124,7 @@ class Starts:
         whole = all(isinstance(s, int | np.integer) and not isinstance(s, bool) and s >= 0 for s in seeds)
         if len(seeds) != copies or not whole:
             raise ControlError(f"seed {seed!r} must be a non-negative integer, or {copies} of them")
-        return [np.random.default_rng(s) for s in seeds]
+        return seeds
 
     def _initial_state(self, options: Mapping[str, Any]) -> dict[str, Floats]:
         """Return the given initial stocks and inner states by name."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Annotated, Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from cirl_marl.errors import ControlError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.processes import no_paths
 
 
 @with_field_docs
@@ -28,11 +29,12 @@ class State:
     batched: Annotated[Floats, "m_fb of this episode, in two parts as in ``Network.circularity``, shape (2, B), mass"]
     circularity: Annotated[Floats, "sum over the episode of the interval means of λ, shape (B,), mass"]
     service: Annotated[Floats, "sum over the episode of the level of each service, shape (services, B)"]
-
-    @property
-    def factors_if_any(self) -> Floats | None:
-        """The factors, None if none are drawn."""
-        return self.factors if len(self.factors) else None
+    processes: Annotated[
+        Floats, "states of the disturbances in all intervals of the episode and the one after, (intervals, names, B)"
+    ] = field(default_factory=no_paths)
+    disturbances: Annotated[Floats, "their values, likewise; what agents do does not change them"] = field(
+        default_factory=no_paths
+    )
 
     def copy(self) -> State:
         """Return the state with arrays of its own."""
@@ -49,15 +51,16 @@ class Snapshot:
     """Everything needed to go on from here, bit for bit."""
 
     state: Annotated[State, "the physical state"]
-    streams: Annotated[tuple[Mapping[str, Any], ...], "state of the random stream of each copy"]
+    streams: Annotated[
+        tuple[Mapping[str, Any], ...], "states of the random streams: that of each copy, then those of its disturbances"
+    ]
     agents: Annotated[tuple[str, ...], "who acts"]
     network: Annotated[Network, "what it is a snapshot of, under its scenario and horizon"]
     legacy_steps: Annotated[int, "the published step counter of a one-agent environment with ``legacy_episode``"] = 0
 
     def check(self, network: Network, copies: int, agents: tuple[str, ...], *, uncertain: bool) -> None:
         """Raise a ``ControlError`` unless ``copies`` of ``network``, in which ``agents`` act, can go back to this."""
-        has_factors = self.state.factors_if_any is not None
-        source = _description(self.network, len(self.streams), self.agents, has_factors)
+        source = _description(self.network, len(self.state.step), self.agents, len(self.state.factors) > 0)
         target = _description(network, copies, agents, uncertain)
         if source != target:
             raise ControlError(f"the snapshot does not fit: it is of {source}; this is {target}")

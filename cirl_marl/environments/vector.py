@@ -26,6 +26,8 @@ from cirl_marl.errors import CirlError, ControlError, unknown_name
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.calendar import years
 from cirl_marl.network.elements import MOMENTS, REWARDS
+from cirl_marl.network.processes import Paths
+from cirl_marl.network.uncertainty import draw_network
 
 MOST = 2**24
 """Most copies, and most decisions of an episode."""
@@ -67,8 +69,8 @@ class MultiAgentVectorEnv:
         rows: which row of the physical state is what.
         supply: the arcs that make up for services.
         controls: their values in the last interval, in the rows of ``network.control_rows``, (controls, num_envs).
-        state_names: nodes, ``compartment.state`` of the inner states, ``arc.row`` of the masses of batch arcs, in the
-            order of ``state()``.
+        state_names: nodes, ``compartment.state`` of the inner states, ``arc.row`` of the masses of batch arcs, and
+            ``disturbance.state`` of the disturbances, in the order of ``state()``.
         episodes: episodes begun in each copy, those gone back to included, shape (num_envs,).
     """
 
@@ -133,14 +135,14 @@ class MultiAgentVectorEnv:
         self.agents = self._actuators.agents
         self.action_spaces = self._actuators.spaces
         self.layout = ObservationLayout(self.dynamics, self.agents, observe, num_envs)
-        self.scoring = Scoring(variant, self.layout, self.agents, num_envs)
+        self.scoring = Scoring(self.dynamics, self.layout, self.agents, num_envs)
         self._idle = self.supply.idle(self.agents)
         self._credit = Credit(self.dynamics, self.supply, self.scoring, self.agents, self.reward_mode, moment)
         self.observation_spaces = self.layout.spaces
         self.observation_names = self.layout.names
         self._starts = Starts(variant, self.dynamics, num_envs, self.layout.array_order)
         self.rows = self.dynamics.rows
-        self.state_names = (*self.rows.start_names, *self.rows.batch_names)
+        self.state_names = (*self.rows.start_names, *self.rows.batch_names, *variant.processes.state_names)
         self.episodes: Integers = np.zeros(num_envs, dtype=np.intp)
         self.controls: Floats = np.empty((len(self.dynamics.neutral), num_envs))
         self._state: State | None = None
@@ -181,7 +183,7 @@ class MultiAgentVectorEnv:
         if suppliers and state is not None and (state.step < self.network.episode.horizon).all():
             controls = self._actuators.controls(self.stack(joint), step)
             idle = self.supply.idle([agent for agent in self.agents if agent not in suppliers])
-            controls = self.supply(state.stock, state.inner, controls, step, idle, state.factors_if_any)
+            controls = self.supply(state.stock, state.inner, controls, step, idle, self.factors_in(step))
             for arc in suppliers:
                 joint[arc] = self.normalise(arc, controls[self.network.control_rows[arc]])
         return joint
@@ -220,7 +222,8 @@ class MultiAgentVectorEnv:
             ControlError: for a seed, option or state that cannot be used; the environment is left as it was.
         """
         start = self._starts.begin(seed, options)
-        self._state = self._fresh(start, self._factors(range(self.num_envs)))
+        copies = range(self.num_envs)
+        self._state = self._fresh(start, self._factors(copies), self._starts.paths(copies))
         self.episodes = self.episodes + 1
         return self.by_agent(self._observe(self._state))
 
@@ -262,6 +265,7 @@ class MultiAgentVectorEnv:
         ``cost_SERVICE``       shortfall 1 − level of each service, shape (B,)
         ``cost``               sum of the shortfalls, shape (B,): what safe reinforcement learning keeps below a budget
         ``drawn``              with ``uncertain``: factors in the order of ``network.uncertain``, shape (B, numbers)
+        ``disturbances``       their values in the interval, a dict disturbance → shape (B,), if there are any
         ``year``               calendar year at the end, shape (B,), if the network begins in one
         =====================  ==================================================================================
         """
@@ -281,12 +285,36 @@ class MultiAgentVectorEnv:
             "cost": cost,
             **dict(zip(self._costs, costs, strict=True)),
         }
-        if (factors := self.physical.factors_if_any) is not None:
-            info["drawn"] = factors.T
+        info |= self.drawn_info(np.maximum(self.physical.step - 1, 0))
         if (year := self.year) is not None:
             year.flags.writeable = False
             info["year"] = year
         return info
+
+    def drawn_info(self, step: Integers) -> dict[str, Any]:
+        """Return what infos say of what an episode drew and what disturbs an interval of each copy, shape (B,)."""
+        info: dict[str, Any] = {"drawn": self.physical.factors.T} if self.uncertain else {}
+        if names := self._starts.processes.names:
+            values = _now(self.physical.disturbances, step)
+            values.setflags(write=False)
+            info["disturbances"] = dict(zip(names, values, strict=True))
+        return info
+
+    def factors_in(self, step: Integers) -> Floats | None:
+        """Return the factors on numbers that are not certain in an interval of each copy, shape (numbers, B), if any.
+
+        Their rows are those of ``dynamics.factors.ranges``.
+        """
+        return self.dynamics.factors(self.physical.factors, self.physical.disturbances, step)
+
+    def certain_network(self, copy: int) -> Network:
+        """Return the network of the episode in a copy: certain, with all that it drew and that disturbs it."""
+        if not self.dynamics.factors.ranges:
+            return self.network
+        state = self.physical
+        path = state.disturbances[:-1, :, copy] if len(state.disturbances) else None
+        network: Network = draw_network(self.network, state.factors[:, copy].tolist(), path)
+        return network
 
     def stack(self, actions: Mapping[str, ArrayLike]) -> Floats:
         """Stack the actions of all agents, shape (entries, B); the checks of ``step`` apply."""
@@ -308,7 +336,7 @@ class MultiAgentVectorEnv:
         if (state.step >= horizon).any():
             raise ControlError(f"the episode is over after {horizon} steps: call reset()")
         controls = self._actuators.controls(actions, state.step)
-        factors = state.factors_if_any
+        factors = self.factors_in(state.step)
         controls = self.controls = self.supply(state.stock, state.inner, controls, state.step, self._idle, factors)
         transition = dynamics.advance(state.stock, state.inner, controls, state.step, factors)
         quantities, flow = self._measure(transition, controls)
@@ -320,10 +348,11 @@ class MultiAgentVectorEnv:
         reward = self._credit.pay(circularity, mean, local, terms, levels, state, controls)
         step = state.step + 1
         measures, totals = quantities[self.layout.signals.measures], (state.circularity + mean, state.service + levels)
+        drawn = (state.processes, state.disturbances)
         self._state = State(
-            transition.stock, transition.inner, flow, measures, step, state.factors, batch_mass, *totals
+            transition.stock, transition.inner, flow, measures, step, state.factors, batch_mass, *totals, *drawn
         )
-        observation = self.layout.observe(quantities, step / horizon, levels)
+        observation = self.layout.observe(quantities, step / horizon, levels, self._sight(self._state))
         success = dynamics.inner.successes(transition.inner, controls)
         return Outcome(observation, reward, local, circularity, mean, levels, service, flow, step >= horizon, success)
 
@@ -333,7 +362,7 @@ class MultiAgentVectorEnv:
         done = np.maximum(state.step - 1, 0)  # the interval that the state is scored in
         quantities = self._quantities(state)
         inner = self.dynamics.inner.rewards(state.inner, state.inner, self.dynamics.neutral_in(done))
-        levels = self.scoring.levels(quantities, done, state.factors_if_any)
+        levels = self.scoring.levels(quantities, done, self.factors_in(done))
         rewards = self.scoring.local_of_all(self.scoring.terms(quantities, levels, inner))
         return dict(zip(self.network.compartments, rewards, strict=True))
 
@@ -341,7 +370,9 @@ class MultiAgentVectorEnv:
         """Return the whole state, shape (B, entries): ``state_names``, then the elapsed share of time."""
         state = self.physical
         time = state.step / self.network.episode.horizon
-        return np.concatenate([state.stock[self.rows.nodes], state.inner, state.stock[self.rows.batches], time[None]]).T
+        processes = _now(state.processes, state.step)
+        masses = state.stock[self.rows.nodes], state.inner, state.stock[self.rows.batches]
+        return np.concatenate([*masses, processes, time[None]]).T
 
     def observations(self) -> Observations:
         """Return the observations that the agents act on next, equal to what the last reset, step or restore gave."""
@@ -392,7 +423,11 @@ class MultiAgentVectorEnv:
         start[:, copies] = self._starts.draw(copies)
         factors = last.factors.copy()
         factors[:, copies] = self._factors(copies)
-        self._state = last.replace(over, self._fresh(start, factors))
+        paths = (last.processes.copy(), last.disturbances.copy())
+        if self._starts.processes.names:
+            fresh = self._starts.paths(copies)
+            paths[0][..., copies], paths[1][..., copies] = fresh.states, fresh.values
+        self._state = last.replace(over, self._fresh(start, factors, Paths(*paths)))
         return self._observe(self._state)
 
     def _next_interval(self) -> Integers:
@@ -404,17 +439,19 @@ class MultiAgentVectorEnv:
         """Draw factors on the uncertain numbers in some copies; no rows if none are to be drawn."""
         return self._starts.factors(copies) if self.uncertain else np.empty((0, len(copies)))
 
-    def _fresh(self, start: Floats, factors: Floats) -> State:
+    def _fresh(self, start: Floats, factors: Floats, paths: Paths) -> State:
         """State at the start of an episode; flows and measures are those that neutral control would give."""
         dynamics, batch = self.dynamics, start.shape[1]
         stocks, inner = self.rows.split(start)
-        scales = factors if self.uncertain else None
         stock, step = dynamics.extend(stocks), np.zeros(batch, dtype=np.intp)
+        scales = dynamics.factors(factors, paths.values, step)
         idle = np.ones((len(self.supply.arcs), 1), dtype=bool)
         neutral = self.supply(stock, inner, dynamics.neutral_in(step), step, idle, scales)
         flow, measures = dynamics.start_flow(stock, inner, neutral, scales), dynamics.inner.measures(inner, neutral)
-        sums = (np.zeros(shape) for shape in ((2, batch), (batch,), (len(self.network.services), batch)))
-        return State(stock, inner, flow, measures, step, factors, *sums)
+        batched, circularity = np.zeros((2, batch)), np.zeros(batch)
+        service = np.zeros((len(self.network.services), batch))
+        sums = (batched, circularity, service)
+        return State(stock, inner, flow, measures, step, factors, *sums, paths.states, paths.values)
 
     def _measure(self, transition: Transition, controls: Floats) -> tuple[Floats, Floats]:
         """Return all quantities in one array, and the mean flows, which are read-only."""
@@ -440,8 +477,18 @@ class MultiAgentVectorEnv:
     def _observe(self, state: State) -> NDArray[np.float32]:
         quantities = self._quantities(state)
         time = state.step / self.network.episode.horizon
-        levels = self.scoring.levels(quantities, np.maximum(state.step - 1, 0), state.factors_if_any)
-        return self.layout.observe(quantities, time, levels)
+        done = np.maximum(state.step - 1, 0)
+        factors = self.dynamics.factors(state.factors, state.disturbances, done)
+        return self.layout.observe(quantities, time, self.scoring.levels(quantities, done, factors), self._sight(state))
+
+    def _sight(self, state: State) -> Floats | None:
+        """Return what the disturbances show of themselves, in the rows of ``layout.sights``; None if nothing."""
+        return self.layout.sights.see(state.processes, state.disturbances, state.step) if self.layout.sights else None
+
+
+def _now(paths: Floats, step: Integers) -> Floats:
+    """Return what paths, shape (intervals, names, B), are in an interval of each copy, shape (names, B)."""
+    return paths[step, :, np.arange(len(step))].T if len(paths) else np.empty((0, len(step)))
 
 
 def _share(weight: float) -> float:

@@ -15,7 +15,6 @@ import numpy as np
 
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
-from cirl_marl.network.uncertainty import draw_network
 from cirl_marl.optimum import Bound, Envelope, bound, envelope
 
 STEP = 1e-4
@@ -85,25 +84,23 @@ def solve_baseline(
 
 
 def bounds_of_draws(
-    network: Network,
+    networks: Sequence[Network],
     agents: Sequence[str],
     starts: Floats,
-    factors: Floats,
     services: Sequence[Floats],
     *,
     progress: Callable[[float], None] = lambda share: None,
 ) -> list[Floats]:
-    """Return the bounds of episodes that drew uncertain numbers, for each of ``services``, shape (episodes,) each.
+    """Return the bounds of episodes that drew numbers, for each of ``services``, shape (episodes,) each.
 
-    An episode is held against the best that somebody could reach who knew what it drew. Every draw has programs of its
-    own: multipliers of the stated numbers would hold too, but prove less, and to write a program down takes as long as
-    to solve it.
+    An episode is held against the best that somebody could reach who knew from the start what it draws. Every draw has
+    programs of its own: multipliers of the stated numbers would hold too, but prove less, and to write a program down
+    takes as long as to solve it.
 
     Args:
-        network: with uncertain numbers.
+        networks: that of each episode, with what it drew.
         agents: who acts.
         starts: shape (episodes, nodes), mass.
-        factors: what each episode drew, shape (episodes, numbers).
         services: mean levels that each row delivered, shape (episodes, services).
         progress: called with the share that is done.
 
@@ -112,8 +109,8 @@ def bounds_of_draws(
         CirlError: if the solver fails.
     """
     proofs = np.empty((len(services), len(starts)))
-    for i, (start, row) in enumerate(zip(starts, factors.tolist(), strict=True)):
-        certain, near = draw_network(network, row), None
+    for i, (start, certain) in enumerate(zip(starts, networks, strict=True)):
+        near = None
         for k, levels in enumerate(services):
             near = bound(certain, start, min_service=levels_to_demand(levels[i]), agents=agents or None, near=near)
             proofs[k, i] = near.objective

@@ -185,14 +185,14 @@ def compare(
     if bounds:
         first_env, done = candidates[0].env(episodes), len(candidates) * share
         starts, levels = starting_stocks(first_env, first), [run.episode_levels for run in rollouts]
-        factors, report = first_env.physical.factors_if_any, part_of(progress, "bounds", done, 1 - done)
+        report = part_of(progress, "bounds", done, 1 - done)
         try:
-            if factors is None:
+            if not first_env.dynamics.factors.ranges:
                 names = [who_acts.name for who_acts in candidates]
                 baseline, bounds_by_entry = _certain_bounds(env, starts, names, levels, report)
             else:
-                draws = bounds_of_draws(env.network, env.agents, starts, factors.T, levels, progress=report)
-                bounds_by_entry = [*draws]
+                draws = [first_env.certain_network(i) for i in range(episodes)]
+                bounds_by_entry = [*bounds_of_draws(draws, env.agents, starts, levels, progress=report)]
         except NoCertificate as missing:
             report(1.0)
             baseline = Baseline(reason=str(missing))

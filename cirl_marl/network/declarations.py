@@ -23,8 +23,8 @@ import numpy as np
 
 from cirl_marl.errors import NetworkError, unknown_name
 
-Kind = Literal["mass", "time", "rate", "flow", "steps", "1"]
-"""Kinds of quantity; a rate is 1/time, a flow mass/time, steps count control intervals."""
+Kind = Literal["mass", "time", "rate", "flow", "steps", "1", "own"]
+"""Kinds of quantity; a rate is 1/time, a flow mass/time, steps count control intervals, ``own`` is not converted."""
 
 Part = TypeVar("Part")
 

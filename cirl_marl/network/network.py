@@ -26,11 +26,12 @@ from cirl_marl.errors import CirlError, NetworkError, unknown_name
 from cirl_marl.network.declarations import declarations
 from cirl_marl.network.elements import SINKS, Arc, Compartment, ControlKind, Law, Node, Role, Service
 from cirl_marl.network.initial_ages import remaining_history
+from cirl_marl.network.processes import DisturbanceProcesses
 from cirl_marl.network.rowsum import Floats, Integers, RowSum, spans
 from cirl_marl.network.series import Series
 from cirl_marl.network.specification import Specification
 from cirl_marl.network.split_fractions import Split, splits
-from cirl_marl.network.uncertainty import highest_factor
+from cirl_marl.network.uncertainty import CERTAIN, factor_ranges
 from cirl_marl.network.validation import problems
 
 if TYPE_CHECKING:
@@ -136,16 +137,17 @@ class Network(Specification):
         A source without a known reserve starts with the most that its scheduled outflows can ask for in an episode, a
         node with a history with what is left of it.
         """
-        ranges = [node.initial or (0.0, 0.0) for node in self.stores]
-        initial = np.array(ranges, dtype=float).reshape(-1, 2).T.copy()
+        bounds = [node.initial or (0.0, 0.0) for node in self.stores]
+        initial = np.array(bounds, dtype=float).reshape(-1, 2).T.copy()
         for i, node in enumerate(self.stores):
             if node.initial is None and node.history is not None:
                 initial[:, i] = remaining_history(node, self.episode.control_interval).sum()
         without_start = {node.id for node in self.stores if node.initial is None and node.history is None}
+        ranges = factor_ranges(self, with_draws=True)
         for arc in self.arcs:
             if arc.donor in without_start:
                 donor = self.nodes[self.node_index[arc.donor]]
-                base = self.interval_means(arc.flow) * highest_factor(self, f"arcs.{arc.id}.flow")
+                base = self.interval_means(arc.flow) * ranges.get(f"arcs.{arc.id}.flow", CERTAIN)[1]
                 base = np.ones_like(base) if arc.law is Law.CONTROLLED else base
                 # a valve on the donor scales all its outflows, a control that sets a flow is of the controlled one
                 sets = [c.control for c in (arc, donor) if c.control is not None]
@@ -184,6 +186,11 @@ class Network(Specification):
     def controllable(self) -> tuple[str, ...]:
         """Compartments that have a control, nodes first, in definition order."""
         return tuple(c.id for c in self.compartments.values() if c.control is not None)
+
+    @cached_property
+    def processes(self) -> DisturbanceProcesses:
+        """The disturbances that disturb something, at work."""
+        return DisturbanceProcesses(self)
 
     @cached_property
     def control_rows(self) -> Mapping[str, slice]:

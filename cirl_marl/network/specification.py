@@ -29,6 +29,9 @@ class Specification:
         objective: circularity and rewards.
         observation: default observation.
         uncertain: how numbers spread that are not known exactly, by their path, such as ``arcs.mining.rate``.
+        disturbances: processes in time that nobody foresees, by name.
+        disturbed: numbers that they disturb, by their path.
+        correlation: what correlates them; None if nothing does.
         default_agents: compartments that act by default; empty means every compartment with a control.
         mass_unit: unit of stocks.
         time_unit: unit of time.
@@ -52,6 +55,9 @@ class Specification:
     objective: Objective = field(default_factory=Objective)
     observation: Observation = field(default_factory=Observation)
     uncertain: Mapping[str, Any] = field(default_factory=dict)
+    disturbances: Mapping[str, Any] = field(default_factory=dict)
+    disturbed: Mapping[str, Any] = field(default_factory=dict)
+    correlation: Any = None
     default_agents: tuple[str, ...] = ()
     mass_unit: str = "kg"
     time_unit: str = "day"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any
 
@@ -21,6 +21,8 @@ from cirl_marl.network.split_fractions import proportions, splits
 WIDE = 4.0
 """Deviations of a normal distribution up to which every distribution goes that states no range, by probability."""
 DISTRIBUTIONS = ("normal", "lognormal", "gamma", "uniform")
+CERTAIN = (1.0, 1.0)
+"""Range of the factor on a number that is certain."""
 KINDS: Mapping[str, type[Any]] = {"nodes": Node, "arcs": Arc, "services": Service}
 """Parts of a network whose numbers may be uncertain, by the key of their table."""
 
@@ -89,76 +91,129 @@ class Spread(CheckedRecord):
         return np.asarray(np.exp(width * special.ndtri(share) - width**2 / 2))
 
 
-def numbers_of(network: Specification, kind: str, field: str) -> dict[str, int]:
-    """Return the rows of uncertain numbers among the factors, by the id of the part of which they are a field."""
+def factor_ranges(network: Specification, *, with_draws: bool) -> dict[str, tuple[float, float]]:
+    """Return the lowest and the highest factor on each number that is not certain, by path, in the order of factors.
+
+    First come the numbers of ``network.uncertain``, if the episode draws them, then those that are only disturbed.
+    """
+    paths = [*network.uncertain, *network.disturbed] if with_draws else network.disturbed
+    return {path: _factor_range(network, path, with_draws=with_draws) for path in paths}
+
+
+def _factor_range(network: Specification, path: str, *, with_draws: bool = True) -> tuple[float, float]:
+    """Return the lowest and the highest factor on a number."""
+    low, high = network.uncertain[path].ends if with_draws and path in network.uncertain else CERTAIN
+    if path not in network.disturbed:
+        return low, high
+    disturbed = network.disturbed[path]
+    ends = network.disturbances[disturbed.by].ends
+    if not disturbed.adds:
+        return min(low * ends[0], high * ends[0]), high * ends[1]
+    parts = disturbed.scale / stated_means(network, path)
+    corners = [end * float(part) for end in ends for part in (parts.min(), parts.max())]
+    return low + min(corners), high + max(corners)
+
+
+def stated_means(network: Specification, path: str) -> Floats:
+    """Return the number at a path as it is stated, its mean in each control interval, shape (horizon,)."""
+    part, name = _uncertain_field(network, path)
+    return network.interval_means(getattr(part, name))
+
+
+def numbers_of(paths: Iterable[str], kind: str, field: str) -> dict[str, int]:
+    """Return the rows of those ``paths`` that are a field of a kind of part, by the id of the part."""
     rows = {}
-    for row, path in enumerate(network.uncertain):
+    for row, path in enumerate(paths):
         part_kind, id_, name = _split(path)
         if (part_kind, name) == (kind, field):
             rows[id_] = row
     return rows
 
 
-def highest_factor(network: Specification, path: str) -> float:
-    """Return the greatest factor on the number at a path; 1 if it is known exactly."""
-    return float(network.uncertain[path].ends[1]) if path in network.uncertain else 1.0
-
-
 def uncertainty_problems(network: Specification) -> Iterator[str]:
-    """Yield why the numbers that are said to be uncertain cannot be drawn."""
-    for path, spread in network.uncertain.items():
+    """Yield why the numbers that are said to be uncertain or disturbed cannot be drawn."""
+    for path in dict.fromkeys([*network.uncertain, *network.disturbed]):
         try:
             part, name = _uncertain_field(network, path)
         except KeyError as error:
             yield f"{path}: {error.args[0]}"
             continue
-        mistakes = list(spread.problems())
+        mistakes = list(network.uncertain[path].problems()) if path in network.uncertain else []
+        if not mistakes and not all(map(math.isfinite, extremes(getattr(part, name)))):
+            mistakes = ["it is infinite, and so is every draw; give the number"]
         if not mistakes and extremes(getattr(part, name)) == (0.0, 0.0):
             mistakes = ["it is 0, and so is every draw; give the number"]
+        if not mistakes and path in network.disturbed and network.disturbed[path].adds:
+            if (stated_means(network, path) <= 0).any():
+                mistakes = ["a disturbance is added only to what is positive at all times; disturb it by a factor"]
         if not mistakes:
-            mistakes = list(_undrawable(network, part, name, spread))
+            mistakes = list(_undrawable(network, part, name, path))
         yield from (f"{path}: {mistake}" for mistake in mistakes)
 
 
-def _undrawable(network: Specification, part: Any, name: str, spread: Spread) -> Iterator[str]:
+def _undrawable(network: Specification, part: Any, name: str, path: str) -> Iterator[str]:
     """Yield why no network could have some of the draws."""
+    disturbed, low = network.disturbed.get(path), _factor_range(network, path)[0]
     if name == "rate" and isinstance(part, Arc) and part.law is Law.BATCH:
         yield "the mass of what is released in batches cannot be uncertain"
     elif name == "stretch" and (part.lifetime is None or part.lifetime.distribution == FIXED_LIFETIME):
-        yield "only a lifetime with a deviation can be stretched"
-    elif name == "stretch" and spread.ends[0] <= 0:
+        yield f"only a lifetime with a deviation can be stretched{' or disturbed' if disturbed else ''}"
+    elif name == "stretch" and low <= 0:
         yield "some draws are 0; give a range above it"
+    elif low < 0:
+        by = f"disturbed by '{disturbed.by}' " if disturbed else ""
+        yield f"{by}it may be {low:.3g} times what is stated; it cannot be negative: give a higher 'low'"
     elif isinstance(part, Service):
-        low, high = (highest_factor(network, f"services.{part.id}.low"), 1.0)
-        if f"services.{part.id}.high" in network.uncertain:
-            high = network.uncertain[f"services.{part.id}.high"].ends[0]
-        ends = network.interval_means(part.low) * low, network.interval_means(part.high) * high
-        if (ends[0] > ends[1]).any():
-            yield "some draws turn the band upside down; give ranges that do not overlap"
+        paths = [f"services.{part.id}.{end}" for end in ("low", "high")]
+        if network.uncertain.keys() & set(paths) or not _move_together(network, *paths):
+            bands = [network.interval_means(end) for end in (part.low, part.high)]
+            if all(((band > 0) & np.isfinite(band)).all() for band in bands):  # else an end is told that is none
+                bands[0] = bands[0] * _factor_range(network, paths[0])[1]
+                bands[1] = bands[1] * _factor_range(network, paths[1])[0]
+            if (bands[0] > bands[1]).any():
+                by = f"disturbed by '{disturbed.by}': " if disturbed else ""
+                yield f"{by}some draws turn the band upside down; give ranges that do not overlap"
 
 
-def draw_network(network: Any, factors: Sequence[float]) -> Any:
+def _move_together(network: Specification, low: str, high: str) -> bool:
+    """Whether one disturbance moves both ends of a band alike, so that it never turns."""
+    return low in network.disturbed and network.disturbed[low] == network.disturbed.get(high)
+
+
+def draw_network(network: Any, factors: Sequence[float] = (), path: Floats | None = None) -> Any:
     """Return the network whose numbers are certain: those that were uncertain, times what was drawn.
 
-    Shares of a donor stay shares of a whole: those that have no control keep their proportions to each other, and an
-    arc that takes the rest gets what they leave, if anything. Sources without a known reserve keep that of ``network``.
+    What is disturbed becomes a series. Shares of a donor stay shares of a whole: those that have no control keep their
+    proportions to each other, and an arc that takes the rest gets what they leave, if anything. Sources without a known
+    reserve keep that of ``network``.
 
     Args:
-        network: with uncertain numbers.
-        factors: of ``network.uncertain``, in their order.
+        network: with uncertain or disturbed numbers.
+        factors: of ``network.uncertain``, in their order; none leave them as they are stated.
+        path: what disturbances are in each control interval, in the rows of ``network.processes``, shape (horizon,
+            names); if something is disturbed. What they are expected to be gives the network that is expected.
     """
     changes: dict[int, tuple[Any, dict[str, Any]]] = {}
 
     def change(part: Any, name: str, value: Any) -> None:
         changes.setdefault(id(part), (part, {}))[1][name] = value
 
-    for path, factor in zip(network.uncertain, factors, strict=True):
-        part, name = _uncertain_field(network, path)
+    drawn = dict(zip(network.uncertain, factors, strict=True)) if len(factors) else {}
+    interval = network.episode.control_interval
+    for number, factor in drawn.items():
+        part, name = _uncertain_field(network, number)
         value = getattr(part, name)
         if isinstance(value, Series):
             change(part, name, replace(value, values=tuple(part_ * float(factor) for part_ in value.values)))
         else:
             change(part, name, value * float(factor))
+    for number, disturbed in network.disturbed.items():
+        assert path is not None
+        (part, name), stated = _uncertain_field(network, number), stated_means(network, number)
+        course = path[: len(stated), network.processes.names.index(disturbed.by)]
+        value = stated * drawn.get(number, 1.0)
+        course = value + disturbed.scale * course if disturbed.adds else value * course
+        change(part, name, in_intervals(course, interval))
     for split in splits(network):
         arcs = [network.arcs[k] for k in split.other_arcs]
         shares_ = [changes.get(id(arc), (arc, {}))[1].get("share", arc.share) for arc in arcs]
@@ -167,7 +222,7 @@ def draw_network(network: Any, factors: Sequence[float]) -> Any:
             remainder = 1.0 - split.bounds[1].sum(axis=0)
             for arc, shares in zip(arcs, proportions(drawn_shares, remainder) * remainder, strict=True):
                 if arc.share is not None:
-                    change(arc, "share", in_intervals(shares, network.episode.control_interval))
+                    change(arc, "share", in_intervals(shares, interval))
     initial: dict[str, Any] = dict(zip((node.id for node in network.stores), network.initial.T.tolist(), strict=True))
     for node in network.stores:
         if node.initial is None and node.history is None:
@@ -177,7 +232,26 @@ def draw_network(network: Any, factors: Sequence[float]) -> Any:
         return replace(part, **changes[id(part)][1]) if id(part) in changes else part
 
     groups = {key: tuple(map(with_draws, getattr(network, key))) for key in KINDS}
-    return replace(network, **groups, uncertain={}, scenarios={})
+    certain: dict[str, Any] = {"uncertain": {}, "disturbances": {}, "disturbed": {}, "correlation": None}
+    return replace(network, **groups, **certain, scenarios={})
+
+
+def expected_network(network: Any, states: Floats | None = None, step: int = 0) -> Any:
+    """Return the certain network in which disturbances are what they are expected to be; one without them as it is.
+
+    Args:
+        network: with disturbed numbers.
+        states: of the processes in interval ``step``, shape (names,); None: before anything is known.
+        step: the interval from which on conditional means hold; before it, what is stated before anything is known.
+    """
+    if not network.disturbed:
+        return network
+    path = network.processes.prior_means(network.episode.horizon)
+    if states is not None:
+        column, rest = states[:, None], network.episode.horizon - step - 1
+        path[step] = network.processes.values(column, step)[:, 0]
+        path[step + 1 :] = network.processes.conditional_means(column, step, rest)[..., 0]
+    return draw_network(network, (), path)
 
 
 def _uncertain_field(network: Specification, path: str) -> tuple[Any, str]:

@@ -258,6 +258,9 @@ def _exclusions(network: Network) -> Iterator[str]:
     batches = [arc.id for arc in network.arcs if arc.law is Law.BATCH]
     if batches:
         yield f"{batches} move batches"
+    if network.disturbed:
+        names = ", ".join(network.processes.names)
+        yield f"nobody foresees what disturbs it ({names}); a program is of a draw, or of what is expected"
 
 
 def normalised_actions(admissible: Admissible, layout: Layout, plan: Floats, intervals: range | None = None) -> Floats:

@@ -27,6 +27,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, ControlError
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record
+from cirl_marl.network.uncertainty import expected_network
 from cirl_marl.optimum.admissible import Admissible, NoCertificate, normalised_actions
 from cirl_marl.optimum.bounds import Bound, bound
 from cirl_marl.optimum.cross_entropy import KNOTS, Incumbent, search_each
@@ -143,7 +144,7 @@ class MPC(Planner):
         self._levels = None if self._min_service is None else demanded_levels(network, self._min_service)
         self.note = ""
         self._env = env
-        self._admissible = Admissible.of(network, env.agents or None)
+        self._admissible = Admissible.of(expected_network(network), env.agents or None)
         self._programs = Programs(self._admissible, self._degree, self._weight, hold_controls=True)
         self._urgent = Programs(self._admissible, self._degree, SERVICE_FIRST, hold_controls=True)
         self._outlooks: dict[int, _Plan] = {}
@@ -289,6 +290,8 @@ class Optimum(Planner):
         """
         try:
             self.plans, self.note = self._bound_plans(env, progress), ""
+            if env.network.disturbed:
+                self.note = "plans for what disturbances are expected to be, carried out whatever they are"
         except NoCertificate as reason:
             self.plans = self._search_plans(env, progress)
             self.note = f"best plan found, no certificate: {reason}"
@@ -301,6 +304,7 @@ class Optimum(Planner):
 
     def _bound_plans(self, env: MultiAgentVectorEnv, progress: Callable[[float], None]) -> list[Bound]:
         plans: list[Bound] = []
+        network = expected_network(env.network)
         by_start: dict[bytes, Bound] = {}  # copies that start alike have the same plan, though their draws differ
         for copy, start in enumerate(env.physical.stock[env.rows.nodes].T):
 
@@ -312,15 +316,15 @@ class Optimum(Planner):
                 report(1.0)
                 continue
             service, weight = self._min_service, self._service_weight
-            solution = bound(env.network, start, min_service=service, service_weight=weight, agents=env.agents or None)
+            solution = bound(network, start, min_service=service, service_weight=weight, agents=env.agents or None)
             report(0.0)
-            plans.append(improve_plan(solution, progress=report))
+            plans.append(replace(improve_plan(solution, progress=report), network=env.network))
             by_start[key] = plans[-1]
         return plans
 
     def _search_plans(self, env: MultiAgentVectorEnv, progress: Callable[[float], None]) -> list[Incumbent]:
-        return search_each(
-            env.network,
+        incumbents = search_each(
+            expected_network(env.network),
             starting_states(env),
             min_service=self._min_service,
             service_weight=self._service_weight,
@@ -328,3 +332,4 @@ class Optimum(Planner):
             knots=min(KNOTS, env.network.episode.horizon),
             progress=lambda share, objective: progress(share),
         )
+        return [replace(incumbent, network=env.network) for incumbent in incumbents]

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network.compartment_model import model_faults
 from cirl_marl.network.declarations import bound_problems
+from cirl_marl.network.disturbances import disturbance_problems
 from cirl_marl.network.elements import IDENTIFIER, Arc, ControlKind, Law
 from cirl_marl.network.specification import Specification
 from cirl_marl.network.split_fractions import splits, trap_problems
@@ -74,7 +75,8 @@ def problems(network: Specification) -> Iterator[str]:
     yield from service_problems(network)
     yield from supply_problems(network)
     yield from setting_problems(network)
-    yield from uncertainty_problems(network)
+    faults = [*_name_problems([("disturbance", name) for name in network.disturbances]), *disturbance_problems(network)]
+    yield from faults or uncertainty_problems(network)
     actuators = dict.fromkeys(c.id for c in (*network.nodes, *network.arcs) if c.control is not None)
     for agent in network.default_agents:
         if agent in compartments and agent not in actuators:

@@ -1,0 +1,518 @@
+"""Disturbances in time: moments and conditional means against closed forms, and networks that they disturb."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy import integrate, stats
+
+from cirl_marl import (
+    Arc,
+    CirlError,
+    Constant,
+    ControlError,
+    DefinitionError,
+    Episode,
+    Law,
+    MultiAgentVectorEnv,
+    Network,
+    NetworkError,
+    Node,
+    Role,
+    Service,
+    bound,
+    load_network,
+    parallel_env,
+)
+from cirl_marl.controllers import Neutral
+from cirl_marl.controllers.rollout import rollout
+from cirl_marl.definitions.reader import write_network
+from cirl_marl.network.disturbances import (
+    AutoRegression,
+    BlockBootstrap,
+    Correlation,
+    Disturbance,
+    DisturbanceEffect,
+    Gaussian,
+    Markov,
+    RandomWalk,
+    Seasonal,
+)
+from cirl_marl.network.processes import Paths
+from cirl_marl.network.uncertainty import Spread, draw_network, expected_network
+from cirl_marl.optimum.mpc import MPC, Optimum
+
+Floats = NDArray[np.floating]
+
+KINDS: Mapping[str, Any] = {
+    "price": AutoRegression(deviation=0.3, persistence=0.8, logarithm=True, low=0.6, high=1.5, forecast=2),
+    "ore": AutoRegression(deviation=0.2, persistence=-0.5, low=0.8, high=1.1, start=1.05, delayed=2),
+    "walk": RandomWalk(deviation=0.1, drift=0.02, low=0.7, high=1.3),
+    "climb": RandomWalk(deviation=0.1, low=0.7, high=1.3, start=1.2, logarithm=True),
+    "outage": Markov(values=(1.0, 0.4, 0.7), matrix=((0.8, 0.15, 0.05), (0.5, 0.5, 0.0), (0.3, 0.0, 0.7))),
+    "stop": Markov(values=(1.0, 0.5), lengths=(8.0, 2.0), start=2),
+    "season": Seasonal(profile=(1.0, 1.2, 0.9), period=4.0, deviation=0.1, persistence=0.6, observed="none"),
+    "harvest": Seasonal(profile=(0.8, 1.2), period=3.0, deviation=0.2, logarithm=True),
+    "record": BlockBootstrap(values=(1.0, 0.8, 1.2, 1.1, 0.9), block=2.5),
+}
+CORRELATION = Correlation(names=("price", "walk", "season"), matrix=((1, 0.8, -0.3), (0.8, 1, 0.0), (-0.3, 0.0, 1)))
+
+
+def line(disturbed: Mapping[str, DisturbanceEffect], names: Mapping[str, Disturbance] = KINDS, **more: Any) -> Network:
+    """Return a mine, whose ore is shared out between a dump and a store that leaks and is to be kept full."""
+    return Network(
+        name="line",
+        nodes=(
+            Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR),
+            Node(id="mill", stores=False),
+            Node(id="store", initial=(40.0, 60.0)),
+            Node(id="dump", role=Role.LANDFILL, initial=(0.0, 0.0)),
+        ),
+        arcs=(
+            Arc(id="dig", donor="mine", recipient="mill", law=Law.EXOGENOUS, flow=10.0),
+            Arc(id="tails", donor="mill", recipient="dump", law=Law.SHARE, share=0.2),
+            Arc(id="metal", donor="mill", recipient="store", law=Law.SHARE),
+            Arc(id="leak", donor="store", recipient="dump", rate=0.1),
+        ),
+        services=(Service(id="metal_kept", provider="store", quantity="stock", low=50.0),),
+        disturbances=names,
+        disturbed=disturbed,
+        **{"episode": Episode(horizon=6), **more},
+    )
+
+
+PLACES = ("arcs.dig.flow", "arcs.tails.share", "arcs.leak.rate", "services.metal_kept.low")
+EVERYWHERE = dict(
+    zip(PLACES, map(lambda name: DisturbanceEffect(by=name), ("price", "season", "outage", "record")), strict=True)
+)
+
+
+def each_alone(name: str) -> Network:
+    """Return a network that one disturbance disturbs."""
+    return line({"arcs.dig.flow": DisturbanceEffect(by=name)}, episode=Episode(horizon=12))
+
+
+def drawn_paths(network: Network, copies: int) -> Paths:
+    """Return paths of copies with seeds 0, 1, …."""
+    return network.processes.sample(range(copies))
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_means_are_those_of_many_draws(name: str) -> None:
+    """Before anything is known, and given F_t: what remains has mean 0 whatever the state was."""
+    processes, disturbance = each_alone(name).processes, KINDS[name]
+    paths = drawn_paths(each_alone(name), 4000)
+    low, high = disturbance.ends
+    assert paths.values.min() >= low and paths.values.max() <= high
+    error = paths.values.std(axis=2)[:, 0] / np.sqrt(4000) + 1e-12
+    assert (np.abs(paths.values.mean(axis=2)[:, 0] - processes.prior_means(13)[:, 0]) < 5 * error).all()
+    means = processes.conditional_means(paths.states[5], 5, 4)
+    for k in range(4):
+        rest = (paths.values[6 + k] - means[k])[0]
+        for weight in (np.ones(4000), paths.values[5, 0] - 1, paths.states[5, 0]):
+            product = rest * weight
+            assert abs(product.mean()) < 5 * product.std() / np.sqrt(4000) + 1e-12
+
+
+@pytest.mark.parametrize("name", [name for name, kind in KINDS.items() if isinstance(kind, Gaussian)])
+@given(state=st.floats(-4, 4), ahead=st.integers(1, 6), step=st.integers(0, 6))
+def test_gaussian_means_are_integrals(name: str, state: float, ahead: int, step: int) -> None:
+    """Of the clipped value over the density of the latent one, φ^k z with variance s²(1 + φ² + …)."""
+    kind = KINDS[name]
+    assert isinstance(kind, Gaussian)
+    network = each_alone(name)
+    phi, noise = kind.memory
+    spread = noise * np.sqrt(sum(phi ** (2 * j) for j in range(ahead)))
+    offset = kind.offsets(step + ahead + 1, 1.0)[-1]
+    low, high = kind.ends
+
+    def density(z: float) -> float:
+        latent = offset + kind.deviation * z
+        value = np.clip(np.exp(latent) if kind.logarithm else latent, low, high)
+        return float(value * stats.norm.pdf(z, phi**ahead * state, spread))
+
+    middle = phi**ahead * state
+    bends = [((np.log(end) if kind.logarithm else end) - offset) / kind.deviation for end in (low, high)]
+    edges = [middle - 12 * spread, middle + 12 * spread]
+    edges[1:1] = sorted(bend for bend in bends if edges[0] < bend < edges[1])
+    parts = [integrate.quad(density, a, b, epsabs=1e-12)[0] for a, b in pairwise(edges)]
+    found = network.processes.conditional_means(np.array([[state]]), step, ahead)[-1, 0, 0]
+    assert found == pytest.approx(sum(parts), abs=1e-9)
+
+
+def test_chains_and_records_by_their_matrix() -> None:
+    """Conditional means are powers of the transition matrix times the values, whatever the state."""
+    outage, record = KINDS["outage"], KINDS["record"]
+    assert isinstance(outage, Markov) and isinstance(record, BlockBootstrap)
+    places, leave = len(record.values), 1 / record.block
+    shift = np.roll(np.eye(places), 1, axis=1) * (1 - leave) + leave / places
+    for name, matrix, values in (("outage", outage.transitions, outage.values), ("record", shift, record.values)):
+        states = np.arange(len(values), dtype=float)[None]
+        found = each_alone(name).processes.conditional_means(states, 0, 5)[:, 0]
+        for k in range(5):
+            np.testing.assert_allclose(found[k], np.linalg.matrix_power(matrix, k + 1) @ values, rtol=1e-12)
+    np.testing.assert_allclose(outage.stationary @ outage.transitions, outage.stationary, atol=1e-12)
+    stop = KINDS["stop"]
+    assert isinstance(stop, Markov)
+    np.testing.assert_allclose(stop.transitions, [[7 / 8, 1 / 8], [1 / 2, 1 / 2]])
+
+
+def test_what_is_correlated_is() -> None:
+    """Innovations by the matrix, and stationary states by what follows from it and their memories."""
+    places = dict(
+        zip(PLACES, map(lambda name: DisturbanceEffect(by=name), ("price", "walk", "season", "stop")), strict=True)
+    )
+    network = line(places, correlation=CORRELATION)
+    states = drawn_paths(network, 20_000).states
+    row = {name: i for i, name in enumerate(network.processes.names)}
+    memory = {name: KINDS[name].memory[0] for name in row if isinstance(KINDS[name], Gaussian)}
+    for i, a in enumerate(CORRELATION.names):
+        for j, b in enumerate(CORRELATION.names):
+            steps = [states[3, row[name]] - memory[name] * states[2, row[name]] for name in (a, b)]
+            assert np.corrcoef(*steps)[0, 1] == pytest.approx(CORRELATION.matrix[i][j], abs=0.03)
+    phi, psi = memory["price"], memory["season"]
+    expected = -0.3 * np.sqrt((1 - phi**2) * (1 - psi**2)) / (1 - phi * psi)
+    for t in (0, 4):
+        assert np.corrcoef(states[t, row["price"]], states[t, row["season"]])[0, 1] == pytest.approx(expected, abs=0.03)
+
+
+def test_streams_are_apart() -> None:
+    """Starts are as without disturbances; a copy's path follows from its seed alone; actions do not change it."""
+    network, certain = line(EVERYWHERE), line({})
+    env, plain = (MultiAgentVectorEnv(each, num_envs=3) for each in (network, certain))
+    env.reset(seed=7)
+    plain.reset(seed=7)
+    np.testing.assert_array_equal(env.physical.stock[1:], plain.physical.stock[1:])  # the mine needs a larger reserve
+    lone = MultiAgentVectorEnv(network, num_envs=1)
+    lone.reset(seed=9)
+    np.testing.assert_array_equal(env.physical.disturbances[..., 2:], lone.physical.disturbances)
+    paths = network.processes.sample((7, 8, 9))
+    np.testing.assert_array_equal(env.physical.processes, paths.states)
+    np.testing.assert_array_equal(env.physical.disturbances, paths.values)
+    shorter = MultiAgentVectorEnv(network, num_envs=3, horizon=4)
+    shorter.reset(seed=7)
+    np.testing.assert_array_equal(shorter.physical.disturbances, paths.values[:5])
+
+
+@st.composite
+def disturbed_networks(draw: st.DrawFn) -> Network:
+    """Draw networks with numbers of every kind that are disturbed, and some that are uncertain, too."""
+    network = draw(st.from_type(Network))
+    paths = [f"arcs.{arc.id}.{name}" for arc in network.arcs for name in ("rate", "flow", "share")]
+    paths += [f"nodes.{node.id}.{name}" for node in network.nodes for name in ("rate", "stretch")]
+    paths += [f"services.{service.id}.{end}" for service in network.services for end in ("low", "high")]
+    names = {name: kind for name, kind in KINDS.items() if kind.ends[0] > 0}
+    names |= {"more": AutoRegression(mean=0.0, deviation=1e-3, persistence=0.5)}
+    spread = Spread(low=0.8, high=1.1, distribution="uniform")
+    network = replace(network, disturbances=names, correlation=CORRELATION, scenarios={})
+    for path in draw(st.lists(st.sampled_from(paths), unique=True, min_size=1, max_size=8)):
+        by, adds = draw(st.sampled_from([*KINDS])), draw(st.booleans())
+        disturbed = DisturbanceEffect(by="more" if adds else by, adds=adds)
+        uncertain = {path: spread} if draw(st.booleans()) else {}
+        try:
+            network = replace(
+                network,
+                disturbed={**network.disturbed, path: disturbed},
+                uncertain={**network.uncertain, **uncertain},
+            )
+        except NetworkError:
+            pass  # this number is not stated, or may become 0
+    assume(network.disturbed)
+    step = network.episode.solver_step  # the fastest draws need a shorter one
+    interval = network.episode.control_interval
+    return network.with_options(episode={} if step is None else {"solver_step": interval / round(3 * interval / step)})
+
+
+@given(disturbed_networks(), st.integers(0, 99))
+def test_a_disturbed_network_is_the_network_of_its_path(network: Network, seed: int) -> None:
+    """Simulated with series of what came; mass is kept, no stock negative; batch = lone, and back is as before."""
+    options: dict[str, Any] = {"uncertain": bool(network.uncertain), "reward": "mixed_difference"}
+    env, lone = (MultiAgentVectorEnv(network, num_envs=copies, **options) for copies in (2, 1))
+    env.reset(seed=seed)
+    lone.reset(seed=seed + 1)
+    certain = MultiAgentVectorEnv(env.certain_network(1), num_envs=1, reward="mixed_difference")
+    start = env.physical.stock[env.rows.nodes, 1].tolist()
+    certain.reset(seed=0, options={"initial_state": dict(zip(env.rows.start_names, start, strict=True))})
+    same_steps = certain.dynamics.substeps == env.dynamics.substeps  # else another part of what is scheduled is cut
+    rng, saved, seen = np.random.default_rng(seed), env.snapshot(), []
+    entries = sum(space.shape[0] for space in env.action_spaces.values())
+    mass = env.physical.stock[: env.rows.unit].sum(axis=0)
+    for _ in range(network.episode.horizon):
+        action = rng.uniform(-1, 1, (entries, 1))
+        outcome = env.advance(np.repeat(action, 2, axis=1))
+        alone, other = lone.advance(action), certain.advance(action)
+        seen.append((action, outcome))
+        np.testing.assert_array_equal(outcome.observation[:, 1], alone.observation[:, 0])
+        np.testing.assert_array_equal(outcome.reward[:, 1], alone.reward[:, 0])
+        assert (env.physical.stock >= 0).all()
+        np.testing.assert_allclose(env.physical.stock[: env.rows.unit].sum(axis=0), mass, rtol=1e-12)
+        for space, row in zip(env.observation_spaces.values(), env.by_agent(outcome.observation).values(), strict=True):
+            assert all(space.contains(copy) for copy in row)
+        if same_steps:
+            for what in ("flow", "circularity_mean", "levels", "reward", "local"):
+                ours, theirs = getattr(outcome, what)[..., 1], getattr(other, what)[..., 0]
+                np.testing.assert_allclose(ours, theirs, rtol=1e-8, atol=1e-8, err_msg=what)
+    env.restore(saved)
+    for action, outcome in seen:
+        np.testing.assert_array_equal(env.advance(np.repeat(action, 2, axis=1)).observation, outcome.observation)
+
+
+def test_a_summand_is_added() -> None:
+    """To what was drawn, in its own unit; the reserve of the mine is enough for whatever comes."""
+    more = AutoRegression(unit="kg/day", mean=0.0, deviation=4.0, persistence=0.5, low=-5.0, high=6.0)
+    network = line(
+        {"arcs.dig.flow": DisturbanceEffect(by="more", adds=True)},
+        {"more": more},
+        uncertain={"arcs.dig.flow": Spread(low=0.9, high=1.1, distribution="uniform")},
+    )
+    env = MultiAgentVectorEnv(network, num_envs=3, uncertain=True)
+    env.reset(seed=0)
+    for t in range(6):
+        outcome = env.advance(np.empty((0, 3)))
+        expected = 10.0 * env.physical.factors[0] + env.physical.disturbances[t, 0]
+        np.testing.assert_allclose(outcome.flow[0], expected, rtol=1e-12)
+    assert network.initial[0, network.node_index["mine"]] == pytest.approx(6 * (11.0 + 6.0))
+
+
+def test_what_agents_see() -> None:
+    """The value of the coming interval, an earlier one, means of later ones, as a share of the largest; or nothing."""
+    names: dict[str, Any] = {**KINDS, "hidden": Markov(values=(1.0, 0.9), lengths=(5.0, 5.0), observed="none")}
+    copper = load_network("copper_net").with_options(episode={"horizon": 5})
+    arcs = [arc.id for arc in copper.arcs if arc.law is Law.DONOR]
+    by = ("price", "ore", "hidden")
+    names["ore"] = replace(names["ore"], observed_by=("mine",))
+    disturbed = {f"arcs.{arc}.rate": DisturbanceEffect(by=name) for arc, name in zip(arcs, by, strict=False)}
+    network = replace(copper, disturbances=names, disturbed=disturbed)
+    env = MultiAgentVectorEnv(network, num_envs=2)
+    seen = env.reset(seed=3)
+    assert env.observation_names["mine"][-5:] == (
+        "disturbance price",
+        "forecast of price in 1 intervals",
+        "forecast of price in 2 intervals",
+        "disturbance ore 2 intervals ago",
+        "time",
+    )
+    assert not any("disturbance ore" in name for name in env.observation_names["use"])
+    size = {name: max(map(abs, names[name].ends)) for name in by}
+    assert env.state_names[-3:] == ("price.latent", "ore.latent", "hidden.regime")
+    for t in range(6):
+        state = env.physical
+        means = network.processes.conditional_means(state.processes[t], t, 2)[:, 0] / size["price"]
+        past = state.disturbances[t - 2, 1] if t >= 2 else np.full(2, 1.05)
+        expected = np.array([state.disturbances[t, 0] / size["price"], *means, past / size["ore"]]).T
+        np.testing.assert_allclose(seen["mine"][:, -5:-1], expected, rtol=1e-6)
+        np.testing.assert_array_equal(env.state()[:, -4:-1], state.processes[t].T)
+        np.testing.assert_array_equal(env.observations()["mine"], seen["mine"])
+        if t < 5:
+            outcome = env.advance(env.stack(env.neutral_action))
+            seen = env.by_agent(outcome.observation)
+            told = env.team_info(outcome)["disturbances"]
+            assert [*told] == [*by]
+            for name, values in zip(by, state.disturbances[t], strict=True):
+                np.testing.assert_array_equal(told[name], values)
+    lone = parallel_env(network)
+    assert set(lone.reset(seed=3)[1]["mine"]["disturbances"]) == {*by}
+
+
+def test_episodes_go_on_drawing() -> None:
+    """In the next episode there is something else; a snapshot has the streams, and fits what it was taken of."""
+    network = line(EVERYWHERE, episode=Episode(horizon=2))
+    env = MultiAgentVectorEnv(network, num_envs=2)
+    env.reset(seed=1)
+    saved, first = env.snapshot(), env.physical.disturbances.copy()
+    for _ in range(2):
+        env.step({})
+    second = env.physical.disturbances.copy()
+    assert (second[:, 0] != first[:, 0]).any()
+    env.restore(saved)
+    for _ in range(2):
+        env.step({})
+    np.testing.assert_array_equal(env.physical.disturbances, second)
+    with pytest.raises(ControlError, match="another definition"):
+        MultiAgentVectorEnv(line({}, episode=Episode(horizon=2)), num_envs=2).restore(saved)
+
+
+def test_plans_are_for_what_is_expected() -> None:
+    """Expected flows are conditional means from the state on; no bound is proved of what nobody foresees."""
+    copper = load_network("copper_net").with_options(episode={"horizon": 6})
+    (arc, *_) = (arc for arc in copper.arcs if arc.law is Law.DONOR)
+    network = replace(copper, disturbances=KINDS, disturbed={f"arcs.{arc.id}.rate": DisturbanceEffect(by="stop")})
+    prior, states = network.processes.prior_means(6)[:, 0], np.array([0.0])
+    expected = expected_network(network)
+    assert isinstance(arc.rate, float)
+    np.testing.assert_allclose(expected.interval_means(expected.arcs[network.arc_index[arc.id]].rate), arc.rate * prior)
+    later = expected_network(network, states, 2)
+    means = network.processes.conditional_means(states[:, None], 2, 3)[:, 0, 0]
+    found = later.interval_means(later.arcs[network.arc_index[arc.id]].rate)
+    np.testing.assert_allclose(found[2:], np.array([1.0, *means]) * arc.rate)
+    with pytest.raises(CirlError, match=r"nobody foresees what disturbs it \(stop\)"):
+        bound(network)
+    env = MultiAgentVectorEnv(network, num_envs=2, agents=["mine"])
+    for controller in (Optimum(min_service=0.5), MPC(replan=6, min_service=0.5)):
+        assert rollout(env, controller).episode_circularity.shape == (2,)
+    assert not expected.disturbed and expected_network(copper) is copper
+
+
+def test_both_ends_of_a_band_may_move_together() -> None:
+    """As one disturbance never turns the band; two may."""
+    network = line({})
+    band = replace(network.services[0], high=55.0)
+    ends = {f"services.metal_kept.{end}": DisturbanceEffect(by="record") for end in ("low", "high")}
+    moved = replace(network, services=(band,), disturbed=ends)
+    env = MultiAgentVectorEnv(moved, num_envs=2)
+    env.reset(seed=0, options={"initial_state": {"mine": 20.0, "store": 70.0}})
+    outcome = env.advance(np.empty((0, 2)))
+    store = env.rows.stocks(env.physical.stock)[moved.node_index["store"]]
+    np.testing.assert_allclose(outcome.levels[0], np.minimum(1.0, 55.0 * env.physical.disturbances[0, 0] / store))
+    other = {**ends, "services.metal_kept.high": DisturbanceEffect(by="outage")}
+    with pytest.raises(NetworkError, match=r"metal_kept.high: disturbed by 'outage': some draws turn the band"):
+        replace(network, services=(band,), disturbed=other)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"outage": replace(KINDS["outage"], matrix=((1.0, 0, 0), (0.5, 0.5, 0), (0, 0, 1.0)))}, "never returns to"),
+        ({"outage": replace(KINDS["outage"], matrix=((0.5, 0.4, 0), (0.5, 0.5, 0), (0, 1, 0)))}, "row 1: .* sum to 1"),
+        (
+            {"outage": Markov(values=(1.0, 0.5), lengths=(5.0, 0.5))},
+            "lengths: needs 2 numbers of intervals, at least 1",
+        ),
+        ({"outage": Markov(values=(1.0, 0.5))}, "give either the matrix or the lengths"),
+        ({"price": AutoRegression(deviation=0.3, persistence=1.0)}, "persistence 1 must lie between -1 and 1"),
+        (
+            {"price": AutoRegression(deviation=0.3, persistence=0.5)},
+            r"arcs.dig.flow: disturbed by 'price' it may be -0.2",
+        ),
+        ({"price": AutoRegression(deviation=0.3, persistence=0.5, low=2.0, high=1.0)}, "low 2 must lie below high 1"),
+        ({"price": replace(KINDS["price"], observed="none")}, "price: forecast: it is hidden"),
+        ({"price": replace(KINDS["price"], delayed=1)}, "price: forecast: .* leave one of the two out"),
+        (
+            {"price": replace(KINDS["price"], forecast=-1)},
+            "forecast -1: must be a number of intervals, 0 to 1000",
+        ),
+        (
+            {"price": replace(KINDS["price"], observed_by=("stor",))},
+            "observed_by: unknown agent 'stor'. Did you mean 'store'",
+        ),
+        ({"walk": replace(KINDS["walk"], start=2.0)}, r"walk: start 2 must lie in \[0.7, 1.3\]"),
+    ],
+)
+def test_mistakes_of_disturbances_are_named(changes: dict[str, Disturbance], message: str) -> None:
+    """By name and number."""
+    with pytest.raises(NetworkError, match=message):
+        line(EVERYWHERE, {**KINDS, **changes})
+
+
+@pytest.mark.parametrize(
+    ("disturbed", "correlation", "message"),
+    [
+        ({"arcs.dig.flow": DisturbanceEffect(by="prise")}, None, "arcs.dig.flow: disturbed_by: .*Did you mean 'price'"),
+        ({"arcs.dig.flw": DisturbanceEffect(by="price")}, None, "of arcs these can be uncertain"),
+        ({"arcs.leak.flow": DisturbanceEffect(by="price")}, None, "arcs.leak.flow: it is 0"),
+        (
+            {"nodes.store.stretch": DisturbanceEffect(by="price")},
+            None,
+            "only a lifetime with a deviation can be stretched",
+        ),
+        ({}, Correlation(names=("price", "outage"), matrix=((1, 0), (0, 1))), "'outage' is of kind 'markov'"),
+        ({}, Correlation(names=("price", "ore"), matrix=((1, 0.5), (0.4, 1))), "is no correlation: symmetric"),
+        (
+            {},
+            Correlation(names=("price", "ore", "walk"), matrix=((1, 0.9, -0.9), (0.9, 1, 0.9), (-0.9, 0.9, 1))),
+            "nothing is correlated like that",
+        ),
+        ({}, Correlation(names=("price", "ore"), matrix=((1,),)), "needs 2 rows of 2 numbers"),
+    ],
+)
+def test_mistakes_of_what_is_disturbed_are_named(
+    disturbed: dict[str, DisturbanceEffect], correlation: Correlation | None, message: str
+) -> None:
+    """By path, or by the table of correlations."""
+    with pytest.raises(NetworkError, match=message):
+        line(disturbed, correlation=correlation)
+
+
+def test_a_file_says_all_of_it(tmp_path: Path) -> None:
+    """What is written reads back to the last bit; a scenario that says what disturbs a quantity keeps its number."""
+    network = line(EVERYWHERE, correlation=CORRELATION)
+    path = tmp_path / "line.toml"
+    write_network(network, path)
+    again = load_network(path)
+    assert again.disturbances == network.disturbances and again.disturbed == network.disturbed
+    assert again.correlation == CORRELATION
+    (tmp_path / "record.csv").write_text("year,grade\n1,1.0\n2,0.8\n3,1.1\n")
+    source = 'source = "measured"'
+    text = (
+        path.read_text()
+        + f"""
+[scenarios.hazards]
+without = ["disturbances.record"]
+
+[scenarios.hazards.disturbances.grade]
+kind = "resampled"
+values = {{ file = "record.csv", column = "grade" }}
+block = 2
+unit = "1"
+{source}
+
+[scenarios.hazards.disturbances.flood]
+kind = "markov"
+values = [0.0, 24.0]
+lengths = [9, 1]
+unit = "kg/hour"
+{source}
+
+[scenarios.hazards.arcs.dig]
+flow = {{ disturbed_by = "flood", disturbed_as = "summand" }}
+
+[scenarios.hazards.services.metal_kept]
+low.disturbed_by = "grade"
+"""
+    )
+    path.write_text(text)
+    hazards = load_network(path, scenario="hazards")
+    assert hazards.arcs[0].flow == 10.0
+    assert hazards.disturbed["arcs.dig.flow"] == DisturbanceEffect(by="flood", adds=True, scale=24.0)
+    assert hazards.disturbances["grade"] == BlockBootstrap(values=(1.0, 0.8, 1.1), block=2.0)
+    assert hazards.disturbed["services.metal_kept.low"].by == "grade" and "record.csv" in hazards.data_sha256
+    for old, new, message in (
+        ('kind = "resampled"', 'kind = "resampledd"', "record.kind: .*Did you mean 'resampled'"),
+        ("block = 2\n", "", r"scenarios.hazards.disturbances.grade.block: missing"),
+        ('"kg/hour"', '"kg"', "flood', which is added: unit 'kg' is inconsistent"),
+        (', disturbed_as = "summand"', "", "'flood' has unit 'kg/hour': a factor has unit '1'"),
+        ('column = "grade"', 'column = "grad"', "Did you mean 'grade'"),
+        ("lengths = [9, 1]", "length = [9, 1]", "Did you mean 'lengths'"),
+    ):
+        path.write_text(text.replace(old, new))
+        with pytest.raises(DefinitionError, match=message):
+            load_network(path, scenario="hazards")
+
+
+def test_supplies_and_difference_rewards_meet_the_same_disturbances() -> None:
+    """What makes up for a service, and what would have been, are those of the network of the path."""
+    example = Path(__file__).parent.parent / "examples" / "metal_cycle.toml"
+    network = load_network(example).scenario("business_as_usual").with_options(episode={"horizon": 5})
+    service = network.services[0].id
+    shaken = replace(
+        network, uncertain={}, disturbances=KINDS, disturbed={f"services.{service}.low": DisturbanceEffect(by="record")}
+    )
+    env = MultiAgentVectorEnv(shaken, num_envs=2, reward="difference")
+    run = rollout(env, Neutral(), seed=2)
+    act = rollout(env, Constant(dict.fromkeys(env.agents[:1], 0.5)), seed=2)
+    for i in range(2):
+        path = shaken.processes.sample([2 + i]).values[:-1, :, 0]
+        other = MultiAgentVectorEnv(draw_network(shaken, (), path), num_envs=2, reward="difference")
+        for ours, controller in ((run, Neutral()), (act, Constant(dict.fromkeys(env.agents[:1], 0.5)))):
+            alone = rollout(other, controller, seed=2)
+            np.testing.assert_allclose(ours.circularity_mean[i], alone.circularity_mean[i], rtol=1e-9)
+            np.testing.assert_allclose(ours.returns[:, i], alone.returns[:, i], atol=1e-9)
