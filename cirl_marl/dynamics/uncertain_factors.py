@@ -13,6 +13,7 @@ import numpy as np
 from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import Law
+from cirl_marl.network.processes import interval_of
 from cirl_marl.network.uncertainty import factor_ranges, numbers_of, stated_means
 
 
@@ -53,11 +54,7 @@ class IntervalFactors:
             return None
         if not self._times and not self._added:
             return draws
-        first = step.item(0)
-        if (step == first).all():
-            now = values[first]
-        else:
-            now = np.ascontiguousarray(values[step, :, np.arange(len(step))].T)
+        now = interval_of(values, step)
         if self._alone is not None:
             alone: Floats = now.take(self._alone, axis=0)
             return alone

@@ -12,7 +12,7 @@ from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import OBSERVE, Arc
-from cirl_marl.network.processes import DisturbanceProcesses
+from cirl_marl.network.processes import DisturbanceProcesses, interval_of
 from cirl_marl.network.rowsum import spans
 
 
@@ -74,6 +74,8 @@ class Sights:
         largest = np.abs(ends).max(axis=1, initial=np.finfo(float).tiny, keepdims=True)
         self._inverse_size, (self.low, self.high) = 1.0 / largest, (ends / largest).T[..., None]
         self._ahead = max((forecast for *_, forecast in self._parts), default=0)
+        plain = not self._ahead and not any(delay for _, _, delay, _ in self._parts)
+        self._at_once = np.array([n for _, n, _, _ in self._parts], dtype=np.intp) if plain else None
 
     def __bool__(self) -> bool:
         """Whether there is anything to be seen."""
@@ -89,14 +91,16 @@ class Sights:
             values: likewise.
             step: the coming interval of each copy, shape (B,).
         """
+        now = interval_of(values, step)
+        if self._at_once is not None:
+            return np.asarray(now.take(self._at_once, axis=0) * self._inverse_size)
         sight = np.empty((len(self.names), len(step)))
-        copies = np.arange(len(step))
         for rows, n, delay, _ in self._parts:
-            past = step - delay
-            sight[rows.start] = np.where(past < 0, self._prior[n], values[np.maximum(past, 0), n, copies])
+            past = interval_of(values[:, n : n + 1], np.maximum(step - delay, 0))[0] if delay else now[n]
+            sight[rows.start] = np.where(step < delay, self._prior[n], past)
         if self._ahead:
             for t in np.unique(step).tolist():
-                of = copies[step == t]
+                of = step == t
                 means = self._processes.conditional_means(np.ascontiguousarray(states[t][:, of]), t, self._ahead)
                 for rows, n, _, forecast in self._parts:
                     sight[rows.start + 1 : rows.stop, of] = means[:forecast, n]

@@ -26,7 +26,7 @@ from cirl_marl.errors import CirlError, ControlError, unknown_name
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.calendar import years
 from cirl_marl.network.elements import MOMENTS, REWARDS
-from cirl_marl.network.processes import Paths
+from cirl_marl.network.processes import Paths, interval_of
 from cirl_marl.network.uncertainty import draw_network
 
 MOST = 2**24
@@ -295,7 +295,7 @@ class MultiAgentVectorEnv:
         """Return what infos say of what an episode drew and what disturbs an interval of each copy, shape (B,)."""
         info: dict[str, Any] = {"drawn": self.physical.factors.T} if self.uncertain else {}
         if names := self._starts.processes.names:
-            values = _now(self.physical.disturbances, step)
+            values = interval_of(self.physical.disturbances, step).view()
             values.setflags(write=False)
             info["disturbances"] = dict(zip(names, values, strict=True))
         return info
@@ -370,7 +370,7 @@ class MultiAgentVectorEnv:
         """Return the whole state, shape (B, entries): ``state_names``, then the elapsed share of time."""
         state = self.physical
         time = state.step / self.network.episode.horizon
-        processes = _now(state.processes, state.step)
+        processes = interval_of(state.processes, state.step)
         masses = state.stock[self.rows.nodes], state.inner, state.stock[self.rows.batches]
         return np.concatenate([*masses, processes, time[None]]).T
 
@@ -423,11 +423,13 @@ class MultiAgentVectorEnv:
         start[:, copies] = self._starts.draw(copies)
         factors = last.factors.copy()
         factors[:, copies] = self._factors(copies)
-        paths = (last.processes.copy(), last.disturbances.copy())
-        if self._starts.processes.names:
-            fresh = self._starts.paths(copies)
-            paths[0][..., copies], paths[1][..., copies] = fresh.states, fresh.values
-        self._state = last.replace(over, self._fresh(start, factors, Paths(*paths)))
+        paths = self._starts.paths(copies)
+        if len(copies) < self.num_envs and len(paths.states):
+            episode = Paths(last.processes.copy(), last.disturbances.copy())
+            episode.states[..., copies], episode.values[..., copies] = paths.states, paths.values
+            paths = episode
+        fresh = self._fresh(start, factors, paths)
+        self._state = fresh if len(copies) == self.num_envs else last.replace(over, fresh)
         return self._observe(self._state)
 
     def _next_interval(self) -> Integers:
@@ -484,11 +486,6 @@ class MultiAgentVectorEnv:
     def _sight(self, state: State) -> Floats | None:
         """Return what the disturbances show of themselves, in the rows of ``layout.sights``; None if nothing."""
         return self.layout.sights.see(state.processes, state.disturbances, state.step) if self.layout.sights else None
-
-
-def _now(paths: Floats, step: Integers) -> Floats:
-    """Return what paths, shape (intervals, names, B), are in an interval of each copy, shape (names, B)."""
-    return paths[step, :, np.arange(len(step))].T if len(paths) else np.empty((0, len(step)))
 
 
 def _share(weight: float) -> float:

@@ -22,6 +22,17 @@ def disturbance_stream(seed: int | None) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STREAM,)))
 
 
+def interval_of(paths: Floats, step: Integers) -> Floats:
+    """Return what paths, shape (intervals, names, B), are in an interval of each copy, shape (names, B)."""
+    if not len(paths):
+        return np.empty((0, len(step)))
+    first = step.item(0)
+    if (step == first).all():  # as it is, but for copies that were put together
+        same: Floats = paths[first]
+        return same
+    return np.ascontiguousarray(paths[step, :, np.arange(len(step))].T)
+
+
 def no_paths() -> Floats:
     """Return the paths of no disturbances, in as many copies as there may be."""
     return np.empty((0, 0, 1))
@@ -113,24 +124,26 @@ class DisturbanceProcesses:
                 latent = self._memory * latent + self._innovation * self._mix(noise[t, self._rows])
                 states[t, self._rows] = latent
         for n, process in self._others:
-            chance = special.ndtr(noise[:, n])
-            state = states[0, n] = process.first(chance[0])
-            for t in range(1, steps):
-                state = states[t, n] = process.later(state, chance[t])
-        values = np.empty_like(states)
-        for t in range(steps):
-            values[t] = self.values(states[t], t)
-        return Paths(states, values)
+            process.follow(special.ndtr(noise[:, n]), states[:, n])
+        return Paths(states, self._values(states, self._offset_table(steps)))
 
     def values(self, states: Floats, step: int) -> Floats:
         """Return ξ of an interval whose states are these, shape (names, B)."""
+        values: Floats = self._values(states[None], self._offset_table(step + 1)[step:])[0]
+        return values
+
+    def _values(self, states: Floats, offsets: Floats) -> Floats:
+        """Return the values of states, shape (steps, names, B); ``offsets`` are a_t, (steps, Gaussian processes, 1)."""
         values = np.empty_like(states)
-        if len(rows := self._rows):
-            latent = self._offset(step) + self._deviation * states[rows]
-            latent[self._is_log] = np.exp(latent[self._is_log])
-            values[rows] = np.clip(latent, self.low[rows, None], self.high[rows, None])
+        for i, n in enumerate(self._rows):
+            latent = states[:, n].copy()
+            latent *= self._deviation[i]
+            latent += offsets[:, i]
+            if self._is_log[i]:
+                np.exp(latent, out=latent)
+            values[:, n] = np.clip(latent, self.low[n], self.high[n], out=latent)
         for n, process in self._others:
-            values[n] = process.values[states[n].astype(np.intp)]
+            values[:, n] = process.values.take(states[:, n].astype(np.intp))
         return values
 
     def conditional_means(self, states: Floats, step: int, ahead: int) -> Floats:
@@ -171,7 +184,10 @@ class DisturbanceProcesses:
         """Return the means of the values of Gaussian processes whose z has these means and variances."""
         if not len(self._rows):
             return latent
-        middle, deviation = self._offset(step) + self._deviation * latent, self._deviation * np.sqrt(variance)
+        middle, deviation = (
+            self._offset_table(step + 1)[step] + self._deviation * latent,
+            self._deviation * np.sqrt(variance),
+        )
         bounds = self.low[self._rows, None], self.high[self._rows, None]
         means = np.empty(middle.shape)
         for is_log in (False, True):
@@ -180,13 +196,12 @@ class DisturbanceProcesses:
             means[rows] = _clipped_means(*of, is_log=is_log)
         return means
 
-    def _offset(self, step: int) -> Floats:
-        """Return a_t, shape (Gaussian processes, 1)."""
-        if step >= len(self._offsets):
-            steps = max(step + 1, 2 * self._steps)
-            self._offsets = np.array([part.offsets(steps, self._interval) for part in self._gaussian]).T[..., None]
-        offset: Floats = self._offsets[step]
-        return offset
+    def _offset_table(self, steps: int) -> Floats:
+        """Return a_t of the first intervals, shape (steps, Gaussian processes, 1)."""
+        if steps > len(self._offsets):
+            offsets = [part.offsets(2 * steps, self._interval) for part in self._gaussian]
+            self._offsets = np.array(offsets).reshape(len(offsets), 2 * steps).T[..., None]
+        return self._offsets[:steps]
 
 
 class _Chain:
@@ -198,18 +213,19 @@ class _Chain:
         shares = chain.stationary
         self.first_shares = shares if chain.start is None else np.eye(len(shares))[chain.start - 1]
 
-    def first(self, chance: Floats) -> Floats:
-        """Return the regimes that even draws from [0, 1] give at the start."""
-        return self._regime(np.tile(self.first_shares.cumsum(), (len(chance), 1)), chance)
-
-    def later(self, regime: Floats, chance: Floats) -> Floats:
-        """Return those an interval later."""
-        return self._regime(self._sums[regime.astype(np.intp)], chance)
-
-    def _regime(self, sums: Floats, chance: Floats) -> Floats:
-        # sums of probabilities may round to less than 1
-        regime: Floats = np.minimum((sums <= chance[:, None]).sum(axis=1), len(self.values) - 1).astype(np.float64)
-        return regime
+    def follow(self, chance: Floats, states: Floats) -> None:
+        """Write the regimes that even draws from [0, 1] give, shape (steps, B) both."""
+        steps, copies = chance.shape
+        # where each regime would go, shape (steps, regimes, B); sums of probabilities may round to less than 1
+        ways = np.zeros((steps, len(self.values), copies), dtype=np.intp)
+        for i, sums in enumerate(self._sums[:, :-1]):
+            for bound in sums:
+                ways[:, i] += chance >= bound
+        regime = (chance[0] >= self.first_shares.cumsum()[:-1, None]).sum(axis=0)
+        states[0], column = regime, np.arange(copies)
+        for t in range(1, steps):
+            regime = ways[t].take(regime * copies + column)
+            states[t] = regime
 
     def expectations(self, ahead: int) -> list[Floats]:
         """Return P^k·values for k = 0 … ``ahead``, shape (regimes,) each."""
@@ -226,14 +242,15 @@ class _Record:
         self.values, self._leave = np.array(record.values), 1.0 / record.block
         self.first_shares = np.full(len(self.values), 1.0 / len(self.values))
 
-    def first(self, chance: Floats) -> Floats:
-        """Return the places that even draws from [0, 1] give at the start."""
-        return np.minimum(np.floor(chance * len(self.values)), len(self.values) - 1)
-
-    def later(self, place: Floats, chance: Floats) -> Floats:
-        """Return those an interval later."""
+    def follow(self, chance: Floats, states: Floats) -> None:
+        """Write the places that even draws from [0, 1] give, shape (steps, B) both."""
+        size = len(self.values)
         # below 1/block a draw begins a block, and says where
-        return np.where(chance < self._leave, self.first(chance / self._leave), (place + 1) % len(self.values))
+        begins, scaled = chance < self._leave, chance * (size / self._leave)
+        states[0] = np.minimum(np.floor(chance[0] * size), size - 1)
+        for t in range(1, len(chance)):
+            place = np.minimum(np.floor(scaled[t]), size - 1)
+            states[t] = np.where(begins[t], place, (states[t - 1] + 1) % size)
 
     def expectations(self, ahead: int) -> list[Floats]:
         """Return E[ξ_{t+k}] by the place in t, for k = 0 … ``ahead``, shape (places,) each."""
