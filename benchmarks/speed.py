@@ -11,8 +11,9 @@ import os
 import platform
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Annotated, Any
@@ -35,12 +36,13 @@ from benchmarks.generated import (
     simple_spread,
     yearly_network,
 )
-from cirl_marl import parallel_env
+from cirl_marl import load_network, parallel_env
 from cirl_marl.environments.parallel import NetworkParallelEnv
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.learners.interface import train, train_seeds
 from cirl_marl.learners.recipe import Recipe, load_recipe
 from cirl_marl.network import Network
+from cirl_marl.network.disturbances import AutoRegression, DisturbanceEffect, Markov
 from cirl_marl.records.machine import processor
 
 console = Console(width=150)
@@ -69,6 +71,7 @@ class Measurement(StrEnum):
     ARCS = "arcs"
     YEARLY = "yearly"
     WORLD = "world"
+    DISTURBED = "disturbed"
 
 
 @dataclass(frozen=True, slots=True)
@@ -378,8 +381,31 @@ def world() -> list[Figure]:
     ]
 
 
+def disturbances() -> list[Figure]:
+    """Measure copper_net in 1 024 copies with outages of two plants and volatile scrap, against itself without."""
+    network = load_network("copper_net")
+    scrap = AutoRegression(deviation=0.3, persistence=0.9, logarithm=True)
+    parts = {
+        "refinery_to_fabrication": Markov(values=(1.0, 0.2), lengths=(60.0, 6.0)),
+        "sorting_to_refinery": Markov(values=(1.0, 0.3), lengths=(50.0, 4.0)),
+        "use_to_landfill": scrap,
+    }
+    effects = {f"arcs.{arc}.rate": DisturbanceEffect(by=arc) for arc in parts}
+    disturbed = replace(network, disturbances=parts, disturbed=effects, scenarios={})
+    envs = [MultiAgentVectorEnv(each, num_envs=COPIES) for each in (network, disturbed)]
+    actions = _actions(envs[0].agents, (COPIES, 1))
+    for env in envs:
+        env.reset(seed=0)
+    horizon = network.episode.horizon
+    blocks = [partial(_seconds, partial(env.step, actions), horizon) for env in envs]
+    without, with_ = _interleaved(9, *blocks)
+    ratio = median(a / b for a, b in zip(without, with_, strict=True))
+    what = "copper_net with three disturbances / without, 1 024 copies"
+    return [Figure(what, f"{ratio:.0%}", "≥ 70 %", ratio >= 0.7, "whole episodes, restarts included; median of rounds")]
+
+
 MEASURES: dict[Measurement, Callable[[], list[Figure]]] = dict(
-    zip(Measurement, (batched, single, share, lockstep, stacked, arcs, yearly, world), strict=True)
+    zip(Measurement, (batched, single, share, lockstep, stacked, arcs, yearly, world, disturbances), strict=True)
 )
 
 

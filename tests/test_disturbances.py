@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
@@ -14,6 +15,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import integrate, stats
+from typer.testing import CliRunner
 
 from cirl_marl import (
     Arc,
@@ -33,8 +35,9 @@ from cirl_marl import (
     load_network,
     parallel_env,
 )
+from cirl_marl.cli import app
 from cirl_marl.controllers import Neutral
-from cirl_marl.controllers.rollout import rollout
+from cirl_marl.controllers.rollout import first_seed, rollout
 from cirl_marl.definitions.reader import write_network
 from cirl_marl.network.disturbances import (
     AutoRegression,
@@ -516,3 +519,30 @@ def test_supplies_and_difference_rewards_meet_the_same_disturbances() -> None:
             alone = rollout(other, controller, seed=2)
             np.testing.assert_allclose(ours.circularity_mean[i], alone.circularity_mean[i], rtol=1e-9)
             np.testing.assert_allclose(ours.returns[:, i], alone.returns[:, i], atol=1e-9)
+
+
+def test_the_command_shows_what_happened(tmp_path: Path) -> None:
+    """Values of each interval in the table of an episode; bands of them, and means of draws, of many."""
+    path = tmp_path / "line.toml"
+    write_network(line(EVERYWHERE), path)
+    shown = CliRunner().invoke(app, ["simulate", str(path), "--out", str(tmp_path)])
+    assert shown.exit_code == 0, shown.output
+    (table,) = tmp_path.glob("*neutral.csv")
+    with table.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    env = MultiAgentVectorEnv(load_network(path), num_envs=1)
+    env.reset(seed=first_seed(0))
+    assert rows[0]["disturbance price (1)"] == ""
+    found = [float(row["disturbance price (1)"]) for row in rows[1:]]
+    np.testing.assert_allclose(found, env.physical.disturbances[:-1, 0, 0])
+    shown = CliRunner().invoke(app, ["simulate", str(path), "--samples", "5", "--out", str(tmp_path)])
+    assert shown.exit_code == 0, shown.output
+    with (tmp_path / "line_neutral_bands.csv").open(newline="") as file:
+        bands = [row for row in csv.DictReader(file) if row["quantity"] == "disturbance outage"]
+    with (tmp_path / "line_neutral_draws.csv").open(newline="") as file:
+        draws = list(csv.DictReader(file))
+    samples = load_network(path).processes.sample(range(first_seed(0), first_seed(0) + 5)).values[:-1]
+    names = load_network(path).processes.names
+    np.testing.assert_allclose([float(row["mean"]) for row in bands], samples[:, names.index("outage")].mean(axis=1))
+    found = [float(row["mean of disturbance record (1)"]) for row in draws]
+    np.testing.assert_allclose(found, samples[:, names.index("record")].mean(axis=0))

@@ -51,7 +51,7 @@ def simulate(
         typer.Option(help="Scenario of the definition; repeat it to compare several; default: the physical one."),
     ] = None,
     samples: Annotated[
-        int | None, typer.Option(min=2, help="Draws of the uncertain numbers, for bands and what causes them.")
+        int | None, typer.Option(min=2, help="Draws of what is uncertain or disturbed, for bands and what causes them.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Directory of CSV and picture; default: here.")] = None,
     html: Html = None,
@@ -63,7 +63,7 @@ def simulate(
     Several scenarios or controllers, or every pair of both, start from the same seed and are compared.
     There is a CSV of each, one picture of all, and a table of the differences to the first.
 
-    With --samples the uncertain numbers of the network are drawn so many times: bands in a CSV and a picture.
+    With --samples uncertain numbers and disturbances are drawn so many times: bands in a CSV and a picture.
     From 70 samples on a table says which number causes most of the spread.
     """
     controls, page = control or ["neutral"], page_for(html)
@@ -102,7 +102,7 @@ def _sample(
     out: Path | None,
     page: Path | None,
 ) -> None:
-    """Simulate draws of the uncertain numbers, and write and say what came of them."""
+    """Simulate draws of uncertain numbers and disturbances, and write and say what came of them."""
     import numpy as np
 
     from cirl_marl.definitions.catalogue import load_network
@@ -114,7 +114,7 @@ def _sample(
     folder, network = folder_for(out or Path(), "--out"), load_network(name, scenario=scenarios[0])
     if steps is not None:
         network = network.with_options(episode={"horizon": steps})
-    if samples >= FEWEST:
+    if samples >= FEWEST and network.uncertain:
         rbd_fast()  # or an error, before anything is simulated
     with bar("sampling") as progress:
         episodes = sample_episodes(network, samples=samples, control=controls[0], seed=seed, progress=progress)
@@ -131,7 +131,7 @@ def _sample(
         say(f"{name}: {spread}; mean {values.mean():{form}}{unit}")
     if causes:
         console.print(sensitivity_table(episodes, causes))
-    else:
+    elif network.uncertain:
         say(f"which number causes the spread is told from {FEWEST} samples on")
     if page is not None:
         from cirl_marl.report.page_html import write_page

@@ -54,6 +54,7 @@ class Rollout:
     shortage: Annotated[Floats, "what scheduled flows lacked, mean over copies, shape (steps, scheduled arcs), mass"]
     final_stock: Annotated[Floats, "mean over copies of the last stocks, shape (stores,), mass"]
     mean_flow: Annotated[Floats, "mean over copies and time of the flows, shape (arcs,), mass/time"]
+    disturbances: Annotated[Floats, "their values in each interval, shape (B, steps, names)"]
 
     @property
     def episode_circularity(self) -> Floats:
@@ -123,7 +124,10 @@ def rollout(
     final = rows.stocks(env.physical.stock).mean(axis=1)
     flows = total_flow / steps
     first_copy = (stock, flow, load, inner, controls)
-    return Rollout(circularity, mean, service, levels, local, returns, *first_copy, shortage, final, flows)
+    values = np.zeros((env.num_envs, steps, len(env.network.processes.names)))
+    if values.size:
+        values[...] = np.moveaxis(env.physical.disturbances[:-1], 2, 0)
+    return Rollout(circularity, mean, service, levels, local, returns, *first_copy, shortage, final, flows, values)
 
 
 def episode_start(env: MultiAgentVectorEnv, seed: int | None = None) -> EpisodeStart:

@@ -1,4 +1,4 @@
-"""What uncertain numbers do to an episode: many draws of them, bands of what comes of it, and which number matters."""
+"""What uncertain numbers and disturbances do to an episode: many draws of them, bands, and which number matters."""
 
 from __future__ import annotations
 
@@ -33,6 +33,7 @@ class SampledEpisodes:
     levels: Annotated[Floats, "level of each service, shape (samples, services, steps)"]
     stock: Annotated[Floats, "stocks after each interval, shape (samples, steps, stores), mass"]
     flow: Annotated[Floats, "mean flows of each interval, shape (samples, steps, arcs), mass/time"]
+    disturbances: Annotated[Floats, "their values in each interval, shape (samples, steps, names)"]
 
 
 @positional_record
@@ -52,13 +53,13 @@ def sample_episodes(
     seed: int = 0,
     progress: Callable[[float], None] = lambda share: None,
 ) -> SampledEpisodes:
-    """Simulate draws of the uncertain numbers, each in an episode from the middle of all initial ranges.
+    """Simulate draws of uncertain numbers and disturbances, each in an episode from the middle of all initial ranges.
 
     The samples are copies of one environment, so that more of them add to those before. The controller knows the
     numbers as they are stated, not what was drawn.
 
     Args:
-        network: with uncertain numbers.
+        network: with uncertain or disturbed numbers.
         samples: how many, at least 2.
         control: controller of all agents.
         seed: of the draws; different seeds share none.
@@ -69,7 +70,8 @@ def sample_episodes(
     """
     if samples < 2:
         raise CirlError(f"samples must be at least 2, got {samples}")
-    env = MultiAgentVectorEnv(network, num_envs=samples, uncertain=True)
+    # without disturbances something has to be uncertain, or there is nothing to draw
+    env = MultiAgentVectorEnv(network, num_envs=samples, uncertain=bool(network.uncertain) or not network.disturbed)
     start_state, horizon = episode_start(env), network.episode.horizon
     stock = np.empty((samples, horizon, len(network.stores)))
     flow = np.empty((samples, horizon, len(network.arcs)))
@@ -81,7 +83,8 @@ def sample_episodes(
 
     run = rollout(env, named_controller(control), seed=first_seed(seed), start=start_state.initial_state, progress=keep)
     factors = env.physical.factors.T.copy()
-    return SampledEpisodes(network, tuple(network.uncertain), factors, run.circularity_mean, run.levels, stock, flow)
+    names, outcome = tuple(network.uncertain), (run.circularity_mean, run.levels, stock, flow, run.disturbances)
+    return SampledEpisodes(network, names, factors, *outcome)
 
 
 def rbd_fast() -> ModuleType:
@@ -102,6 +105,8 @@ def sensitivities(episodes: SampledEpisodes) -> list[Sensitivity]:
     Raises:
         CirlError: for fewer than 70 samples, from which nothing can be told, or if SALib is missing.
     """
+    if not episodes.names:
+        return []  # what changes all the time is no single number
     analysis = rbd_fast()
     count = len(episodes.circularity)
     if count < FEWEST:

@@ -49,7 +49,8 @@ class Simulation:
 
         Columns are year or date at the end, if the network has a start on the calendar, λ at the end and the mean of λ,
         the service level, stocks at the end, mean flows, what passes through nodes without stock, masses on the way,
-        inner states that an agent may see and mean ages. ``env`` is left at the start of the episode.
+        inner states that an agent may see, mean ages, and what disturbed the interval. ``env`` is left at the start of
+        the episode.
         """
         env, run = self.env, self.rollout
         self.episode_start.reset(env)
@@ -67,8 +68,10 @@ class Simulation:
             *run.load.T,
             *run.inner.T,
             *(age[1:] for age in ages),
+            *run.disturbances[0].T,
         )
         states = [*load.tolist(), *inner.tolist(), *(float(age[0]) for age in ages)]
+        states += [None] * run.disturbances.shape[2]
         first = [*[None] * 3, *stock.tolist(), *[None] * len(flows), *states]
         times = np.concatenate([[0.0], interval_ends(env.network)])
         clock = zip(times.tolist(), *labels(env.network, times)[1], strict=True)
@@ -85,7 +88,8 @@ class Simulation:
         header += [f"throughput of {node.id} ({mass}/{time})" for node in network.nodes if not node.stores]
         header += [f"mass on {line.id} ({mass})" for line in self.env.dynamics.batches.lines]
         header += [physics.names[row] for row in physics.visible]
-        return [*header, *(f"mean age of {node.id} ({time})" for node in network.stores if node.lifetime is not None)]
+        header += [f"mean age of {node.id} ({time})" for node in network.stores if node.lifetime is not None]
+        return [*header, *disturbance_columns(network)]
 
     def write(self, path: str | Path) -> Path:
         """Write ``table`` to a CSV file, whole or not at all, and return its path; missing folders are made."""
@@ -93,6 +97,12 @@ class Simulation:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, lambda partial: write_table(partial, *self.table()))
         return path
+
+
+def disturbance_columns(network: Network) -> list[str]:
+    """Return headers of the values of disturbances, with their units."""
+    processes = network.processes
+    return [f"disturbance {n} ({d.unit})" for n, d in zip(processes.names, processes.disturbances, strict=True)]
 
 
 def simulate(

@@ -110,7 +110,7 @@ def page_of_samples(samples: SampledEpisodes, control: str) -> ReportPage:
         levels=tuple(_quantiles(samples.levels[:, s]) for s in range(len(network.services))),
         about=SAMPLES.format(count),
     )
-    note = f"Flows and stocks are means of {count} samples of the uncertain numbers."
+    note = f"Flows and stocks are means of {count} samples of what is uncertain or disturbed."
     return ReportPage(_title(network), network, (episode,), notes=(note,))
 
 
@@ -162,7 +162,7 @@ def add_plan(
     Raises:
         CirlError: if a solver fails, or nobody acts.
     """
-    level = None if env.uncertain else levels_to_demand(comparison.entries[0].rollout.episode_levels[0])
+    level = None if env.dynamics.factors.ranges else levels_to_demand(comparison.entries[0].rollout.episode_levels[0])
     optimum = Optimum(min_service=level, service_weight=SERVICE_FIRST if level is None else None)
     controller = ProgressController(optimum, progress)
     outcome = rollout(env, controller, seed=comparison.first_seed, progress=controller.report_steps)

@@ -14,6 +14,7 @@ from rich.table import Table
 from cirl_marl.controllers.rollout import interval_ends
 from cirl_marl.drawing.style import SERIES, axis_time, readable
 from cirl_marl.evaluation.sampling import SampledEpisodes, Sensitivity
+from cirl_marl.evaluation.simulations import disturbance_columns
 from cirl_marl.evaluation.statistics import finite_or_none
 from cirl_marl.network import Floats
 from cirl_marl.records.files import publish_folder, write_table
@@ -22,6 +23,8 @@ from cirl_marl.report.terminal import text_table
 from cirl_marl.report.trajectory import time_columns
 
 QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
+SHOWN = 3
+"""Single samples in a picture."""
 ROWS = 8
 """Largest number of causes in a table on screen."""
 
@@ -73,7 +76,9 @@ def _draws(samples: SampledEpisodes) -> tuple[list[str], list[list[object]]]:
     network = samples.network
     header = ["sample", *(f"factor on {name}" for name in samples.names), f"mean circularity ({network.mass_unit})"]
     header += [f"mean level of {service.id}" for service in network.services]
+    header += [f"mean of {name}" for name in disturbance_columns(network)]
     columns = [samples.factors, samples.circularity.mean(axis=1)[:, None], samples.levels.mean(axis=2)]
+    columns.append(samples.disturbances.mean(axis=1))
     return header, [[i, *row] for i, row in enumerate(np.concatenate(columns, axis=1).tolist())]
 
 
@@ -93,6 +98,10 @@ def _quantities(samples: SampledEpisodes) -> Iterator[tuple[str, str, Floats]]:
     yield from ((f"level of {service.id}", "1", samples.levels[:, s]) for s, service in enumerate(network.services))
     yield from ((f"stock of {node.id}", mass, samples.stock[:, :, i]) for i, node in enumerate(network.stores))
     yield from ((f"flow of {arc.id}", flow, samples.flow[:, :, k]) for k, arc in enumerate(network.arcs))
+    parts = zip(network.processes.names, network.processes.disturbances, strict=True)
+    yield from (
+        (f"disturbance {name}", part.unit, samples.disturbances[:, :, n]) for n, (name, part) in enumerate(parts)
+    )
 
 
 def save_bands(path: str | Path, samples: SampledEpisodes, *, title: str) -> Path:
@@ -104,16 +113,18 @@ def save_bands(path: str | Path, samples: SampledEpisodes, *, title: str) -> Pat
     panels = []
     for name, unit, values in [*quantities[: 1 + min(3, services)], *uncertain][:PANELS]:
         time = axis_time(ends if name.startswith("stock") else ends - network.episode.control_interval / 2, network)
-        draw = partial(_draw_bands, time=time, bands=np.quantile(values, QUANTILES, axis=0))
+        draw = partial(_draw_bands, time=time, bands=np.quantile(values, QUANTILES, axis=0), draws=values[:SHOWN])
         panels.append(Panel(readable(name), unit, draw, LEVELS if name.startswith("level") else None))
-    return save_panels(path, network, panels, title=title, legend=3)
+    return save_panels(path, network, panels, title=title, legend=4)
 
 
-def _draw_bands(axes: Axes, time: Floats, bands: Floats) -> None:
+def _draw_bands(axes: Axes, time: Floats, bands: Floats, draws: Floats) -> None:
     lowest, low, median, high, highest = bands
     axes.fill_between(time, lowest, highest, color=SERIES[0], alpha=0.18, linewidth=0, label="95 % of samples")
     axes.fill_between(time, low, high, color=SERIES[0], alpha=0.35, linewidth=0, label="half of them")
     axes.plot(time, median, color=SERIES[0], label="median")
+    for i, draw in enumerate(draws):
+        axes.plot(time, draw, color=SERIES[1], linewidth=0.7, label="" if i else f"{len(draws)} of them")
 
 
 def _width(values: Floats) -> float:
