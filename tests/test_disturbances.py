@@ -39,6 +39,8 @@ from cirl_marl.cli import app
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import first_seed, rollout
 from cirl_marl.definitions.reader import write_network
+from cirl_marl.evaluation import compare
+from cirl_marl.evaluation.statistics import worst_mean
 from cirl_marl.network.disturbances import (
     AutoRegression,
     BlockBootstrap,
@@ -53,6 +55,7 @@ from cirl_marl.network.disturbances import (
 from cirl_marl.network.processes import Paths
 from cirl_marl.network.uncertainty import Spread, draw_network, expected_network
 from cirl_marl.optimum.mpc import MPC, Optimum
+from cirl_marl.report.tradeoffs import summary_of, worst_notes
 
 Floats = NDArray[np.floating]
 
@@ -546,3 +549,34 @@ def test_the_command_shows_what_happened(tmp_path: Path) -> None:
     np.testing.assert_allclose([float(row["mean"]) for row in bands], samples[:, names.index("outage")].mean(axis=1))
     found = [float(row["mean of disturbance record (1)"]) for row in draws]
     np.testing.assert_allclose(found, samples[:, names.index("record")].mean(axis=0))
+
+
+def test_the_worst_episodes_are_told(tmp_path: Path) -> None:
+    """CVaR with a fraction of an episode, its interval, and that of every policy in tables and files."""
+    rng = np.random.default_rng(0)
+    draws = rng.normal(size=(400, 250))
+    tail = stats.norm.pdf(stats.norm.ppf(0.05)) / -0.05
+    found = [worst_mean(row) for row in draws]
+    for row, figure in zip(draws[:20], found, strict=False):
+        lowest = np.sort(row)[:13]
+        assert figure.value == pytest.approx((lowest[:12].sum() + 0.5 * lowest[12]) / 12.5)
+    assert np.mean([figure.value for figure in found]) == pytest.approx(tail, abs=0.05)
+    assert np.mean([figure.low <= tail <= figure.high for figure in found]) > 0.85
+    assert worst_mean(np.array([3.0, 1.0, 2.0])).value == 1.0
+    network = line(EVERYWHERE)
+    comparison = compare((), ("neutral",), network=network, bounds=False)
+    assert comparison.episodes == 256
+    assert compare((), ("neutral",), network=line({}), bounds=False).episodes == 64
+    (row,) = comparison.rows
+    kept = comparison.entries[0].rollout
+    np.testing.assert_array_equal(
+        kept.disturbances[3], network.processes.sample([comparison.first_seed + 3]).values[:-1, :, 0]
+    )
+    circularity, level = row.worst()
+    assert circularity.value == worst_mean(kept.episode_circularity).value < kept.episode_circularity.mean()
+    assert level.low <= level.value <= level.high and level.value < row.levels()[0].value == kept.episode_levels.mean()
+    assert "worst level of metal_kept" in worst_notes(comparison)[0]
+    assert summary_of(comparison)["rows"][0]["worst_service_levels"]["metal_kept"]["value"] == level.value
+    held = compare((), ("neutral",), network=network.with_options(episode={"horizon": 3}), episodes=3)
+    entry = held.entries[0]
+    assert entry.bound is not None and (entry.bound >= entry.circularity - 1e-6).all() and np.ptp(entry.bound) > 0.1

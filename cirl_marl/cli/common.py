@@ -77,6 +77,9 @@ EpisodeSeed = Annotated[
     ),
 ]
 EpisodeCount = Annotated[int, typer.Option(min=2, help="Fresh episodes to evaluate on.")]
+EpisodesOfRun = Annotated[
+    int | None, typer.Option(min=2, help="Fresh episodes; default: 64, or 256 of a network that is disturbed.")
+]
 Uncertain = Annotated[
     bool | None,
     typer.Option("--uncertain/--certain", help="Whether every episode draws the uncertain numbers of the network."),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -39,7 +40,9 @@ def compare(
         typer.Option(help="Catalogue name, FILE.toml or FILE.toml:REGION; default: the network of the runs."),
     ] = None,
     scenario: Scenario = None,
-    episodes: EpisodeCount = 16,
+    episodes: Annotated[
+        int | None, typer.Option(min=2, help="Fresh episodes; default: 16, or 256 of a network that is disturbed.")
+    ] = None,
     seed: Seed = 0,
     min_service: MinService = None,
     uncertain: Uncertain = None,
@@ -56,19 +59,34 @@ def compare(
     Where nothing bounds a network, optimum is the best plan that a search by simulation finds, without certificate.
     """
     from cirl_marl.evaluation import compare as compared
-    from cirl_marl.report.tradeoffs import comparison_notes, comparison_table, write_comparison
+    from cirl_marl.report.tradeoffs import comparison_notes, comparison_table, worst_table, write_comparison
 
     names = common.comma_separated(controllers)
     folder, page = None if out is None else common.folder_for(out, "--out"), common.page_for(html)
+    episodes = _enough(16, network, scenario, runs or []) if episodes is None else episodes
     options: dict[str, Any] = {"episodes": episodes, "seed": seed, "min_service": min_service, "uncertain": uncertain}
     with shares() as progress:
         comparison = compared(runs or [], names, network=network, scenario=scenario, progress=progress, **options)
     console.print(comparison_table(comparison))
+    if comparison.network.disturbed:
+        console.print(worst_table(comparison))
     for note in comparison_notes(comparison):
         say(note)
     files = [] if folder is None else write_comparison(comparison, folder, controllers=names, **options)
     for path in [*files, *common.browser_report(page, comparison)]:
         say(f"wrote {path}")
+
+
+def _enough(certain: int, network: str | None, scenario: str | None, runs: Sequence[Path]) -> int:
+    """Return the default number of episodes of a network, or else of that of the first run."""
+    from cirl_marl.definitions.catalogue import load_network
+    from cirl_marl.evaluation.comparison import enough_episodes
+    from cirl_marl.learners.run_directory import RunDirectory
+
+    if network is None and not runs:
+        return certain  # nothing can be compared, which is told elsewhere
+    definition = RunDirectory(runs[0]).network() if network is None else load_network(network, scenario=scenario)
+    return enough_episodes(definition, certain=certain)
 
 
 @app.command(rich_help_panel=COMPARISONS)

@@ -13,6 +13,7 @@ from cirl_marl.cli.common import (
     OBSERVE,
     REWARDS,
     EpisodeCount,
+    EpisodesOfRun,
     Html,
     RunPath,
     Scenario,
@@ -123,19 +124,19 @@ def _directories(out: Path | None, network: str, recipe: str, seeds: Sequence[in
 
 
 @app.command(rich_help_panel=LEARNERS)
-def evaluate(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0) -> None:
+def evaluate(run: RunPath, episodes: EpisodesOfRun = None, seed: Seed = 0) -> None:
     """Compare the trained policies with neutral and random control on fresh seeds, and with the best possible.
 
     The gap is to an upper bound, which no episode from the same start that serves at least as well exceeds.
     """
     from cirl_marl.evaluation import assessment
-    from cirl_marl.report.terminal import evaluation_table, local_returns_table
+    from cirl_marl.report.terminal import local_returns_table
 
     with shares() as progress:
         evaluation = assessment.evaluate(run, episodes=episodes, seed=seed, progress=progress)
     figures = evaluation.figures
     _write_figures(evaluation)
-    console.print(evaluation_table(figures))
+    _print_tables(evaluation)
     console.print(local_returns_table(figures))
     say(assessment.acting_checkpoint(evaluation.run))
     _say_lacking(evaluation)
@@ -155,7 +156,7 @@ def export(
 
 
 @app.command(rich_help_panel=LEARNERS)
-def report(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0, html: Html = None) -> None:
+def report(run: RunPath, episodes: EpisodesOfRun = None, seed: Seed = 0, html: Html = None) -> None:
     """Evaluate a run and draw its pictures anew.
 
     With --html the policies stand beside business as usual and the plan of the bound: as long as ``cirl evaluate``.
@@ -286,13 +287,22 @@ def _say_lacking(evaluation: Evaluation) -> None:
             say(f"{name}: {line}")
 
 
-def evaluate_and_draw(directory: Path, episodes: int, seed: int, page: Path | None = None) -> None:
+def _print_tables(evaluation: Evaluation) -> None:
+    """Print the figures of an evaluation, of a disturbed network the worst episodes too."""
+    from cirl_marl.report.terminal import evaluation_table
+    from cirl_marl.report.tradeoffs import worst_table
+
+    console.print(evaluation_table(evaluation.figures))
+    if evaluation.comparison.network.disturbed:
+        console.print(worst_table(evaluation.comparison))
+
+
+def evaluate_and_draw(directory: Path, episodes: int | None, seed: int, page: Path | None = None) -> None:
     """Evaluate a run, say what came of it and draw its pictures; with ``page`` also hold it against the best."""
     from cirl_marl.evaluation import assessment
     from cirl_marl.evaluation.comparison import part_of
     from cirl_marl.report.presentation import draw_run
     from cirl_marl.report.report_page import PLAN, page_of_evaluation
-    from cirl_marl.report.terminal import evaluation_table
 
     share = 1.0 if page is None else EVALUATION_SHARE
     with shares() as progress:
@@ -305,7 +315,7 @@ def evaluate_and_draw(directory: Path, episodes: int, seed: int, page: Path | No
         )
         story = None if page is None else page_of_evaluation(evaluation, part_of(progress, PLAN, share, 1 - share))
     _write_figures(evaluation)
-    console.print(evaluation_table(evaluation.figures))
+    _print_tables(evaluation)
     say(assessment.acting_checkpoint(evaluation.run))
     _say_lacking(evaluation)
     for path in draw_run(evaluation):

@@ -53,6 +53,10 @@ class Evaluation:
         for name, figures in self.figures["controllers"].items():
             line = f"{name}: λ̄ {figures['circularity']['value']:.5g} {unit}"
             line += f", service level {figures['service_level']['value']:.4f}"
+            if self.comparison.network.disturbed:
+                worst = [f"λ̄ {figures['worst_circularity']['value']:.5g} {unit}"]
+                worst += [f"{id_} {level['value']:.4f}" for id_, level in figures["worst_service_levels"].items()]
+                line += f"; of the 5 % worst episodes {', '.join(worst)}"
             gap = figures.get("gap", {}).get("value")
             lines.append(line + (f", gap to the bound {gap:.1%}" if gap is not None else ""))
         return "\n".join([*lines, acting_checkpoint(self.run)])
@@ -79,7 +83,7 @@ class Evaluation:
 def evaluate(
     run: str | Path | RunDirectory,
     *,
-    episodes: int = 64,
+    episodes: int | None = None,
     seed: int = 0,
     bounds: bool = True,
     progress: Callable[[str, float], None] = lambda stage, share: None,
@@ -88,7 +92,7 @@ def evaluate(
 
     Args:
         run: directory of a training run.
-        episodes: how many, at least 2.
+        episodes: how many, at least 2; None: 64, or 256 of a network that is disturbed.
         seed: different seeds share no episode.
         bounds: whether to hold the episodes against the best possible, which takes longer than the episodes.
         progress: called with what is being done and the share of all that is done.
@@ -100,7 +104,7 @@ def evaluate(
     run = run if isinstance(run, RunDirectory) else RunDirectory(run)
     comparison = compare([run], CONTROLLERS, episodes=episodes, seed=seed, bounds=bounds, progress=progress)
     entries = dict(zip(("trained", *CONTROLLERS), comparison.entries, strict=True))
-    env = run.make_env(episodes)
+    env = run.make_env(comparison.episodes)
     figures = summary(env, {name: entry.rollout for name, entry in entries.items()})
     for name, entry in entries.items():
         if entry.bound is not None and entry.gap is not None:

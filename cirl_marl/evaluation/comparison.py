@@ -18,7 +18,7 @@ from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.baselines import Baseline, bounds_of_draws, solve_baseline
 from cirl_marl.evaluation.contenders import contenders
 from cirl_marl.evaluation.figures import gain
-from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, SHARE, Aggregate, over_episodes, over_seeds
+from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, SHARE, Aggregate, over_episodes, over_seeds, worst_mean
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
@@ -30,6 +30,8 @@ LIMITS = {"service": SHARE, "gap": (0.0, np.inf)}
 """Within which figures lie: the bound is proved, so that no gap is below 0."""
 SOLVER_SHARE = 0.7
 """Share of solving programs in the work on bounds; the rest is to evaluate their multipliers for every episode."""
+EPISODES_DISTURBED = 256
+"""Episodes from which on something can be said of the 5 % worst."""
 ProgressReport = Callable[[str, float], None]
 """Takes what is being done and the share of all that is done."""
 
@@ -92,6 +94,22 @@ class Row:
             return over_episodes(samples[0], LIMITS.get(name, EVERYWHERE))
         return over_seeds([[sample.mean() for sample in samples]])
 
+    def levels(self) -> list[Aggregate]:
+        """Return the mean level of each service: of trained policies over seeds, as ``figure`` does."""
+        samples = np.array([entry.rollout.episode_levels for entry in self.entries])
+        means = [
+            over_seeds([row.mean(axis=1)]) if self.seeds else over_episodes(row[0], SHARE) for row in _last(samples)
+        ]
+        return means
+
+    def worst(self) -> list[Aggregate]:
+        """Return the mean of the 5 % worst episodes of λ̄, then of the level of each service."""
+        figures = [np.column_stack([entry.circularity, entry.rollout.episode_levels]) for entry in self.entries]
+        return [
+            over_seeds([[worst_mean(row).value for row in rows]]) if self.seeds else worst_mean(rows[0])
+            for rows in _last(np.array(figures))
+        ]
+
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
@@ -120,13 +138,18 @@ class Comparison:
         return tuple(Row(name, tuple(entries)) for name, entries in groups.items())
 
 
+def _last(samples: Floats) -> Floats:
+    """Return figures of entries, shape (entries, episodes, figures), figure by figure."""
+    return np.moveaxis(samples, 2, 0)
+
+
 def compare(
     runs: Sequence[str | Path | RunDirectory] = (),
     controllers: Sequence[str] = ("neutral", "random"),
     *,
     network: str | Path | Network | None = None,
     scenario: str | None = None,
-    episodes: int = 64,
+    episodes: int | None = None,
     seed: int = 0,
     min_service: ArrayLike | None = None,
     bounds: bool = True,
@@ -143,7 +166,7 @@ def compare(
         controllers: names of controllers, see ``optimum.registry``.
         network: catalogue name, definition file or network; None is that of the first run.
         scenario: of ``network``; None is the default.
-        episodes: at least 2.
+        episodes: at least 2; None: 64, or 256 of a network that is disturbed.
         seed: different seeds share no episode.
         min_service: mean level of every service, or of each, shape (services,), that ``mpc`` and ``optimum`` plan for;
             None: as much as can be had.
@@ -156,7 +179,7 @@ def compare(
         CirlError: for input that cannot be used, a controller that does not fit the network, or a solver that fails.
         RunError: if a run is incomplete, or of another environment.
     """
-    if episodes < 2:
+    if episodes is not None and episodes < 2:
         raise CirlError(f"episodes must be at least 2 for a confidence interval, got {episodes}")
     if network is None and scenario is not None:
         raise CirlError(f"scenario '{scenario}' goes with a network; runs have their own")
@@ -172,6 +195,7 @@ def compare(
         min_service,
         uncertain,
     )
+    episodes = enough_episodes(env.network) if episodes is None else episodes
     first = first_seed(seed)
     share = 1 / (len(candidates) + (len({who_acts.name for who_acts in candidates}) if bounds else 0))
     rollouts, checkpoints = [], []
@@ -206,6 +230,11 @@ def compare(
         for candidate, checkpoint, run, bound in zip(candidates, checkpoints, rollouts, bounds_by_entry, strict=True)
     )
     return Comparison(env.network, env.agents, first, entries, baseline)
+
+
+def enough_episodes(network: Network, *, certain: int = 64) -> int:
+    """Return how many episodes say enough of a network: of one that is disturbed more than of a ``certain`` one."""
+    return EPISODES_DISTURBED if network.disturbed else certain
 
 
 def starting_stocks(env: MultiAgentVectorEnv, seed: int) -> Floats:

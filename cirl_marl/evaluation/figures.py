@@ -12,7 +12,7 @@ from typing import Any
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.definitions.writer import fingerprint
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.evaluation.statistics import SHARE, over_episodes
+from cirl_marl.evaluation.statistics import SHARE, Aggregate, over_episodes, worst_mean
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.batch_circularity import CIRO_FACTOR
@@ -39,8 +39,8 @@ def summary(env: MultiAgentVectorEnv, rollouts: Mapping[str, Rollout]) -> dict[s
     """Return the figures of each controller beside those of ``neutral``, ready for JSON.
 
     Each figure is a mean over episodes with its 95 % confidence interval; gains are paired, episode by episode, with
-    the neutral controller's from the same start. A network that states the criticality of its material has its
-    time-window circularity as well (see ``time_window``).
+    the neutral controller's from the same start. What is ``worst`` is the mean of the 5 % worst episodes. A network
+    that states the criticality of its material has its time-window circularity as well (see ``time_window``).
     """
     neutral = rollouts["neutral"]
     figures = {}
@@ -49,6 +49,9 @@ def summary(env: MultiAgentVectorEnv, rollouts: Mapping[str, Rollout]) -> dict[s
             "circularity": over_episodes(run.episode_circularity).as_dict(),
             "circularity_gain": over_episodes(gain(run, neutral)).as_dict(),
             "service_level": over_episodes(run.episode_service, SHARE).as_dict(),
+            "service_levels": _by_service(env, [over_episodes(row, SHARE) for row in run.episode_levels.T]),
+            "worst_circularity": worst_mean(run.episode_circularity).as_dict(),
+            "worst_service_levels": _by_service(env, [worst_mean(row) for row in run.episode_levels.T]),
             "service_level_over_neutral": over_episodes(run.episode_service - neutral.episode_service).as_dict(),
             "return": _by_agent(env, run.returns),
             "local_return": _by_agent(env, run.local_returns),
@@ -56,6 +59,10 @@ def summary(env: MultiAgentVectorEnv, rollouts: Mapping[str, Rollout]) -> dict[s
         if env.network.objective.criticality is not None:
             figures[name]["time_window_circularity"] = over_episodes(time_window(env.network, run)).as_dict()
     return {"unit": env.network.mass_unit, "episodes": env.num_envs, "controllers": figures}
+
+
+def _by_service(env: MultiAgentVectorEnv, figures: Sequence[Aggregate]) -> dict[str, Any]:
+    return {service.id: figure.as_dict() for service, figure in zip(env.network.services, figures, strict=True)}
 
 
 def _by_agent(env: MultiAgentVectorEnv, samples: Floats) -> dict[str, Any]:

@@ -25,6 +25,8 @@ ENOUGH_SEEDS = 5
 TRIM_SHARE = 0.25
 """Share of the scores that the interquartile mean leaves out at either end."""
 RESAMPLES = 10_000
+WORST, TAIL_RESAMPLES = 0.05, 1000
+"""Share of the episodes that count as the worst, and resamples of what is said of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +63,30 @@ def over_episodes(samples: Floats, within: tuple[float, float] = (-np.inf, np.in
     half_width = float(stats.t.ppf(0.975, len(samples) - 1) * error)
     low, high = within
     return Aggregate(mean, max(mean - half_width, min(low, mean)), min(mean + half_width, max(high, mean)))
+
+
+def worst_mean(samples: ArrayLike, *, resamples: int = TAIL_RESAMPLES, seed: int = 0) -> Aggregate:
+    """Return the mean of the worst 5 % of independent episodes (CVaR), those with the lowest figures.
+
+    Of n episodes the lowest 0.05·n count, the last of them with the fraction that is left. The interval is that of the
+    percentile bootstrap; a single episode has none.
+
+    References: Rockafellar and Uryasev 2002, Conditional value-at-risk for general loss distributions.
+
+    >>> worst_mean(np.arange(50.0)).value
+    0.6
+    """
+    figures = np.sort(np.asarray(samples, dtype=float))
+    count = len(figures)
+    tail = WORST * count
+    # the k lowest weigh 1 each, the next what is left of 0.05·n
+    weights = np.clip(tail - np.arange(count), 0.0, 1.0) / tail if tail >= 1 else np.eye(count)[0]
+    value = float(figures @ weights)
+    if count < 2:
+        return Aggregate(value, float("nan"), float("nan"))
+    picks = np.random.default_rng(seed).integers(count, size=(resamples, count))
+    low, high = np.quantile(np.sort(figures[picks], axis=1) @ weights, (0.025, 0.975)).tolist()
+    return Aggregate(value, low, high)
 
 
 def interquartile_mean(scores: ArrayLike) -> float:

@@ -25,6 +25,7 @@ from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.mpc import SERVICE_FIRST, Optimum
 from cirl_marl.report.explanations import read_reasons
+from cirl_marl.report.tradeoffs import worst_notes
 
 QUANTILES = (0.025, 0.5, 0.975)
 USUAL, PLAN = "business as usual", "plan of the bound"
@@ -145,6 +146,8 @@ def page_of_comparison(comparison: Comparison, *, without: Sequence[str] = ()) -
     baseline = comparison.baseline
     notes = [f"Flows, stocks and actions are those of the first of {comparison.episodes} episodes."]
     notes += [f"No bound: {baseline.reason}."] if baseline.reason else []
+    if network.disturbed:
+        notes += ["Worst: mean of the 5 % worst episodes of each figure by itself.", *worst_notes(comparison)]
     return ReportPage(_title(network), network, tuple(episodes), tuple(points), baseline.front, tuple(notes))
 
 

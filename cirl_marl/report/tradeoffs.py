@@ -36,6 +36,42 @@ def comparison_table(comparison: Comparison) -> Table:
     return text_table(title, headings, rows, text=["policy"])
 
 
+def worst_table(comparison: Comparison) -> Table:
+    """One row a recipe or controller: what is expected of each service, and the 5 % worst episodes of each figure."""
+    rows = [
+        [name, *cells] for name, cells in zip([row.name for row in comparison.rows], _worst(comparison), strict=True)
+    ]
+    title = "expected, and mean of the 5 % worst episodes of each figure by itself; 95 % intervals in brackets"
+    return text_table(title, ["policy", *_worst_headers(comparison)], rows, text=["policy"])
+
+
+def worst_notes(comparison: Comparison) -> list[str]:
+    """Return the rows of ``worst_table`` as sentences, without intervals."""
+    heads = _worst_headers(comparison)
+    return [
+        f"{row.name}: "
+        + ", ".join(f"{head} {cell.splitlines()[0]}" for head, cell in zip(heads, cells, strict=True))
+        + "."
+        for row, cells in zip(comparison.rows, _worst(comparison), strict=True)
+    ]
+
+
+def _worst_headers(comparison: Comparison) -> list[str]:
+    services = [service.id for service in comparison.network.services]
+    worst = [f"worst λ̄ ({comparison.network.mass_unit})", *(f"worst level of {id_}" for id_ in services)]
+    return [*(f"level of {id_}" for id_ in services), *worst]
+
+
+def _worst(comparison: Comparison) -> list[list[str]]:
+    """Return the cells of each row, in the order of ``_worst_headers``."""
+    forms = ["{:.4f}"] * len(comparison.network.services)
+    forms = [*forms, FORMS[0], *forms]
+    return [
+        [_interval(figure, form) for figure, form in zip([*row.levels(), *row.worst()], forms, strict=True)]
+        for row in comparison.rows
+    ]
+
+
 def comparison_notes(comparison: Comparison) -> list[str]:
     """Return what the reader of a comparison's table has to know."""
     notes, baseline = [], comparison.baseline
@@ -104,7 +140,12 @@ def summary_of(comparison: Comparison, **options: Any) -> dict[str, Any]:
     rows = []
     for row in comparison.rows:
         figures = {name: row.figure(name) for name in FIGURES}
-        plain = {name: None if figure is None else figure.as_dict() for name, figure in figures.items()}
+        plain: dict[str, Any] = {k: None if figure is None else figure.as_dict() for k, figure in figures.items()}
+        ids = [service.id for service in comparison.network.services]
+        levels, (worst, *worst_levels) = row.levels(), row.worst()
+        plain["worst_circularity"] = worst.as_dict()
+        for name, parts in (("service_levels", levels), ("worst_service_levels", worst_levels)):
+            plain[name] = {id_: part.as_dict() for id_, part in zip(ids, parts, strict=True)}
         rows.append({"name": row.name, "seeds": list(row.seeds), **plain})
     return {
         "provenance": provenance(comparison.network, runs, **options),
