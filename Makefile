@@ -52,7 +52,7 @@ notebooks: $(VENV)/.docs  ## run the notebooks whose scripts have changed and ke
 	$(BIN)/python -m docs.site.notebooks
 
 written: $(VENV)/.runtime  ## the JSON schema of networks, docs/format.md and tables of docs/reference.md, from the code
-	$(BIN)/python -m cirl_marl.definitions.format_guide
+	$(BIN)/python -m docs.site.format_guide
 	$(BIN)/python -m docs.site.reference
 
 fuzz: $(VENV)/.dev  ## 10 000 mutated definitions and recipes, each refused or one that works (half an hour)

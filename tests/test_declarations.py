@@ -15,7 +15,6 @@ from cirl_marl.definitions.catalogue import folder
 from cirl_marl.definitions.conversion import Converter
 from cirl_marl.definitions.data_files import DataFiles
 from cirl_marl.definitions.error_messages import validation_mistakes
-from cirl_marl.definitions.format_guide import format_guide
 from cirl_marl.definitions.schema import NetworkTable, table_of
 from cirl_marl.definitions.writer import _Writer, definition_of, fingerprint
 from cirl_marl.network.declarations import (
@@ -28,6 +27,7 @@ from cirl_marl.network.declarations import (
     frozen_record,
 )
 from cirl_marl.network.elements import Control, Episode, Objective, Observation, Service
+from docs.site.format_guide import format_guide
 
 DOCUMENT = tomllib.loads((folder("envs") / "copper_net.toml").read_text(encoding="utf-8"))
 MODES = ("slow", "fast")

@@ -1,16 +1,19 @@
-"""The fields of the file format as a document, from their declarations: ``docs/format.md``."""
+"""The fields of the file format as a document, from their declarations: ``python -m docs.site.format_guide``.
+
+Writes ``docs/format.md`` and the schema of definition files, with which editors complete and check them.
+"""
 
 from __future__ import annotations
 
 import json
 import textwrap
-from pathlib import Path
 from typing import Any, get_args
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from cirl_marl.definitions import quantities, schema
+from docs.site.markdown import ROOT
 
 PARTS: dict[str, tuple[Any, str]] = {
     "network": (schema.NetworkTable, "The file itself"),
@@ -70,6 +73,6 @@ def _wrap(line: str, indent: int = 2) -> str:
 
 
 if __name__ == "__main__":
-    Path("docs/format.md").write_text(format_guide(), encoding="utf-8")
+    (ROOT / "docs" / "format.md").write_text(format_guide(), encoding="utf-8")
     schema_ = json.dumps(schema.json_schema(), indent=2, ensure_ascii=False) + "\n"
-    Path("envs/network.schema.json").write_text(schema_, encoding="utf-8")
+    (ROOT / "envs" / "network.schema.json").write_text(schema_, encoding="utf-8")
