@@ -170,7 +170,7 @@ def test_tables_of_plan_and_simulate_are_the_same_course(tmp_path: Path) -> None
     env = MultiAgentVectorEnv(network, num_envs=1)
     planned = schedule(env, Random(), seed=3)
     planned.write(tmp_path / "plan.csv")
-    simulation = Simulation("", "random", env, planned.episode_start, planned.start, planned.rollout)
+    simulation = Simulation("", "random", env, planned.episode_start, planned.rollout)
     simulation.write(tmp_path / "simulated.csv")
     (one,) = episodes_of_plan(network, tmp_path / "plan.csv", seed=3)
     (two,) = episodes_of_plan(network, tmp_path / "simulated.csv")
@@ -190,7 +190,7 @@ def test_tables_of_plan_and_simulate_are_the_same_course(tmp_path: Path) -> None
     with pytest.raises(CirlError, match=r"bad\.csv, line 2: .* is 'x', not a number"):
         episodes_of_plan(network, tmp_path / "bad.csv", seed=3)
     (tmp_path / "short.csv").write_text("\n".join([*text[:2], "1,2"]))
-    with pytest.raises(CirlError, match=r"line 3: has 2 cells"):
+    with pytest.raises(CirlError, match=r"line 3: 2 cells in"):
         episodes_of_plan(network, tmp_path / "short.csv", seed=3)
 
 

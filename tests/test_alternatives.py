@@ -136,8 +136,8 @@ def test_each_alternative_is_what_it_is_alone(definition: Path, seed: int | None
         for array in ("circularity", "levels", "stock", "flow"):
             np.testing.assert_array_equal(getattr(each.rollout, array), getattr(run, array))
         episode_start(env, seed).reset(env)
-        np.testing.assert_array_equal(each.start, env.physical.stock[env.rows.nodes, 0])
-    assert (found[0].start != found[0].rollout.stock[-1]).any()
+        np.testing.assert_array_equal(each.rollout.start, env.physical.stock[env.rows.nodes, 0])
+    assert (found[0].rollout.start != found[0].rollout.stock[-1]).any()
 
 
 def test_names_say_what_there_are_several_of(definition: Path) -> None:

@@ -55,6 +55,9 @@ class Rollout:
     final_stock: Annotated[Floats, "mean over copies of the last stocks, shape (stores,), mass"]
     mean_flow: Annotated[Floats, "mean over copies and time of the flows, shape (arcs,), mass/time"]
     disturbances: Annotated[Floats, "their values in each interval, shape (B, steps, names)"]
+    start: Annotated[Floats, "stocks at the start in the first copy, shape (stores,), mass"]
+    start_load: Annotated[Floats, "masses that batch arcs hold then, shape (batch arcs,), mass"]
+    start_inner: Annotated[Floats, "inner states that an agent may see then, shape (states,)"]
 
     @property
     def episode_circularity(self) -> Floats:
@@ -91,8 +94,11 @@ def rollout(
     ``MultiAgentVectorEnv.reset``). ``progress`` is called with the number of intervals done.
     """
     observations = env.reset(seed=seed, options={"initial_state": start or {}})
-    controller.start(env, seed)
     steps, rows, batches, physics = env.network.episode.horizon, env.rows, env.dynamics.batches, env.dynamics.inner
+    before = env.physical
+    stocks, loads = (masses(before.stock)[:, 0].copy() for masses in (rows.stocks, batches.loads))
+    origin = (stocks, loads, before.inner[physics.visible, 0].copy())
+    controller.start(env, seed)
     circularity, mean, service = np.empty((3, env.num_envs, steps))
     levels = np.empty((env.num_envs, len(env.network.services), steps))
     local, returns = np.zeros((2, len(env.agents), env.num_envs))
@@ -127,7 +133,9 @@ def rollout(
     values = np.zeros((env.num_envs, steps, len(env.network.processes.names)))
     if values.size:
         values[...] = np.moveaxis(env.physical.disturbances[:-1], 2, 0)
-    return Rollout(circularity, mean, service, levels, local, returns, *first_copy, shortage, final, flows, values)
+    return Rollout(
+        circularity, mean, service, levels, local, returns, *first_copy, shortage, final, flows, values, *origin
+    )
 
 
 def episode_start(env: MultiAgentVectorEnv, seed: int | None = None) -> EpisodeStart:

@@ -23,9 +23,8 @@ from cirl_marl.records.files import write_atomically, write_table
 class Schedule:
     """One episode: the network, a header with units, columns of shape (columns, steps), its start, and the rollout.
 
-    ``usual`` is what becomes of the same start if nobody acts, ``agents`` are those who do. It begins with the stocks
-    ``start``, shape (stores,), mass. ``control`` names who acts, empty for learnt policies; ``note`` is what has to be
-    said beside the figures.
+    ``usual`` is what becomes of the same start if nobody acts, ``agents`` are those who do. ``control`` names who acts,
+    empty for learnt policies; ``note`` is what has to be said beside the figures.
     """
 
     network: Network
@@ -35,7 +34,6 @@ class Schedule:
     rollout: Rollout
     usual: Rollout
     agents: tuple[str, ...]
-    start: Floats
     control: str = ""
     note: str = ""
 
@@ -81,8 +79,6 @@ def schedule(
     if env.num_envs != 1 or not env.agents:
         raise CirlError(f"network '{network.name}': a plan is of one copy in which somebody acts")
     origin = episode_start(env, seed)
-    origin.reset(env)
-    start = env.rows.stocks(env.physical.stock)[:, 0].copy()
     usual = rollout(env, Neutral(), seed=origin.seed, start=origin.initial_state)
     run = rollout(env, controller, seed=origin.seed, start=origin.initial_state, progress=progress)
     values = run.controls[:, np.r_[tuple(network.control_rows[agent] for agent in env.agents)]].T
@@ -97,7 +93,7 @@ def schedule(
         ("service level (1)", run.service[0]),
     ]
     header, table = zip(*columns, strict=True)
-    return Schedule(network, header, np.array(table), origin, run, usual, env.agents, start)
+    return Schedule(network, header, np.array(table), origin, run, usual, env.agents)
 
 
 CONTROL_NAMES = {

@@ -17,7 +17,7 @@ from cirl_marl.controllers.pyramids import pyramids
 from cirl_marl.controllers.rollout import EpisodeStart, Rollout, episode_start, interval_ends, rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
-from cirl_marl.network import Floats, Network
+from cirl_marl.network import Network
 from cirl_marl.network.calendar import labels
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.registry import SETTABLE, named_controller
@@ -32,7 +32,6 @@ class Simulation:
     control: Annotated[str, "name of the controller"]
     env: Annotated[MultiAgentVectorEnv, "one copy, in which it was simulated; alternatives of one scenario share it"]
     episode_start: Annotated[EpisodeStart, "where the episode began"]
-    start: Annotated[Floats, "stocks there, shape (stores,), mass"]
     rollout: Annotated[Rollout, "what came of it"]
 
     @property
@@ -49,17 +48,12 @@ class Simulation:
 
         Columns are year or date at the end, if the network has a start on the calendar, λ at the end and the mean of λ,
         the service level, stocks at the end, mean flows, what passes through nodes without stock, masses on the way,
-        inner states that an agent may see, mean ages, and what disturbed the interval. ``env`` is left at the start of
-        the episode.
+        inner states that an agent may see, mean ages, and what disturbed the interval.
         """
         env, run = self.env, self.rollout
-        self.episode_start.reset(env)
-        start = env.physical
-        stock, load = env.rows.stocks(start.stock)[:, 0], env.dynamics.batches.loads(start.stock)[:, 0]
-        inner = start.inner[env.dynamics.inner.visible, 0]
         lambdas = (run.circularity[0], run.circularity_mean[0])
         flows = (*run.flow.T, *env.network.throughput(run.flow.T))
-        ages = [pyramid.mean_age for pyramid in pyramids(env.network, run, stock)]
+        ages = [pyramid.mean_age for pyramid in pyramids(env.network, run, run.start)]
         columns = (
             *lambdas,
             run.service[0],
@@ -70,9 +64,9 @@ class Simulation:
             *(age[1:] for age in ages),
             *run.disturbances[0].T,
         )
-        states = [*load.tolist(), *inner.tolist(), *(float(age[0]) for age in ages)]
+        states = [*run.start_load.tolist(), *run.start_inner.tolist(), *(float(age[0]) for age in ages)]
         states += [None] * run.disturbances.shape[2]
-        first = [*[None] * 3, *stock.tolist(), *[None] * len(flows), *states]
+        first = [*[None] * 3, *run.start.tolist(), *[None] * len(flows), *states]
         times = np.concatenate([[0.0], interval_ends(env.network)])
         clock = zip(times.tolist(), *labels(env.network, times)[1], strict=True)
         rows = [first, *zip(*(column.tolist() for column in columns), strict=True)]
@@ -231,10 +225,8 @@ def _run(
     name: str, control: str, env: MultiAgentVectorEnv, reporter: ProgressController, seed: int | None
 ) -> Simulation:
     start_state = episode_start(env, seed)
-    start_state.reset(env)
-    start = env.rows.stocks(env.physical.stock)[:, 0].copy()
     run = rollout(env, reporter, seed=start_state.seed, start=start_state.initial_state, progress=reporter.report_steps)
-    return Simulation(name, control, env, start_state, start, run)
+    return Simulation(name, control, env, start_state, run)
 
 
 def _tell(progress: Callable[[float], None], done: int, of: int, share: float) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import episode_start, first_seed, rollout
 from cirl_marl.controllers.schedule import control_names
+from cirl_marl.definitions.data_files import csv_lines, even_lines, number_in
 from cirl_marl.dynamics.stages import simulated_network
 from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.environments.actuators import Actuators
@@ -89,14 +89,7 @@ class _Table:
         if not path.is_file():
             raise CirlError(f"{path}: no such file; a plan is a CSV file of cirl plan or cirl simulate, or a run")
         self.path = path
-        try:
-            with path.open(newline="", encoding="utf-8") as file:
-                self.header, *self.rows = list(csv.reader(file))
-        except (ValueError, UnicodeDecodeError, csv.Error) as error:
-            raise CirlError(f"{path}: is no CSV file with a header: {error}") from error
-        for line, row in enumerate(self.rows, 2):
-            if len(row) != len(self.header):
-                raise CirlError(f"{path}, line {line}: has {len(row)} cells, the header has {len(self.header)}")
+        (_, self.header), *self.rows = even_lines(str(path), csv_lines(str(path), path.read_bytes()))
 
     def check_steps(self, network: Network, intervals: int) -> None:
         """Check how many intervals it has, which are those of an episode."""
@@ -109,11 +102,8 @@ class _Table:
         if name not in self.header:
             raise CirlError(f"{self.path}: {unknown_name('column', name, self.header)} It is no plan of this network")
         place, numbers = self.header.index(name), []
-        for line, row in enumerate(self.rows[first:], first + 2):
-            try:
-                numbers.append(float(row[place]))
-            except ValueError:
-                numbers.append(math.nan)
+        for line, row in self.rows[first:]:
+            numbers.append(number_in(row[place]))
             if not math.isfinite(numbers[-1]):
                 raise CirlError(f"{self.path}, line {line}: '{name}' is {row[place]!r}, not a number")
         return np.array(numbers)

@@ -130,4 +130,4 @@ def _trajectory(simulation: Simulation, quantity: ComparedQuantity) -> tuple[Flo
     if quantity.kind == "flow":
         return middle, episode.flow[:, network.arc_index[quantity.of]]
     row = network.node_index[quantity.of]  # nodes with a stock come first
-    return np.append(0.0, ends), np.append(simulation.start[row], episode.stock[:, row])
+    return np.append(0.0, ends), np.append(episode.start[row], episode.stock[:, row])

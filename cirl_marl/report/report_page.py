@@ -90,7 +90,7 @@ def page_of_alternatives(simulations: Sequence[Simulation]) -> ReportPage:
     """Return the page of ``cirl simulate``."""
     network, note = simulations[0].network, f"Start: {simulations[0].episode_start.description}."
     episodes = tuple(
-        _episode(case.name or readable(case.control), case.network, case.env.agents, case.start, case.rollout)
+        _episode(case.name or readable(case.control), case.network, case.env.agents, case.rollout)
         for case in simulations
     )
     return ReportPage(_title(network), network, episodes, notes=(note,))
@@ -120,7 +120,7 @@ def page_of_schedule(schedule: Schedule) -> ReportPage:
     network, note = schedule.network, schedule.note
     name = PLAN if schedule.control == "optimum" and not note else schedule.control or "trained"
     episodes = tuple(
-        _episode(title, network, schedule.agents, schedule.start, outcome)
+        _episode(title, network, schedule.agents, outcome)
         for title, outcome in ((USUAL, schedule.usual), (name, schedule.rollout))
     )
     notes = (f"Start: {schedule.episode_start.description}.", *([note] if note else []))
@@ -129,7 +129,7 @@ def page_of_schedule(schedule: Schedule) -> ReportPage:
 
 def page_of_comparison(comparison: Comparison, *, without: Sequence[str] = ()) -> ReportPage:
     """Return the page of ``cirl compare``, neutral control first, but for the rows ``without`` whom it shall be."""
-    network, start = comparison.network, _first_start(comparison)
+    network = comparison.network
     episodes, points = [], []
     for row in sorted(comparison.rows, key=lambda row: row.name != "neutral"):
         if row.name in without:
@@ -140,7 +140,7 @@ def page_of_comparison(comparison: Comparison, *, without: Sequence[str] = ()) -
         for entry in row.entries:
             seed = "" if entry.seed is None else f"seed {entry.seed}"
             name = title if len(row.entries) == 1 else f"{title}, seed {entry.seed}"
-            episodes.append(_episode(name, network, comparison.agents, start, entry.rollout, figures))
+            episodes.append(_episode(name, network, comparison.agents, entry.rollout, figures))
             service, circularity = float(entry.rollout.least_service.mean()), float(entry.circularity.mean())
             points.append(PlanePoint(title, service, circularity, seed))
     baseline = comparison.baseline
@@ -169,7 +169,7 @@ def add_plan(
     optimum = Optimum(min_service=level, service_weight=SERVICE_FIRST if level is None else None)
     controller = ProgressController(optimum, progress)
     outcome = rollout(env, controller, seed=comparison.first_seed, progress=controller.report_steps)
-    episode = _episode(PLAN, comparison.network, comparison.agents, _first_start(comparison), outcome)
+    episode = _episode(PLAN, comparison.network, comparison.agents, outcome)
     service, circularity = float(outcome.least_service[0]), float(outcome.episode_circularity[0])
     point = PlanePoint(PLAN, service, circularity, "of the first episode")
     condition = "serving as well as can be" if level is None else "with no less service than the policies gave there"
@@ -203,18 +203,10 @@ def page_of_front(front: ParetoFront) -> ReportPage:
     return ReportPage(_title(front.network), front.network, points=tuple(points), front=front.front, notes=notes)
 
 
-def _first_start(comparison: Comparison) -> Floats:
-    """Return the stocks with which the first episode begins, shape (stores,), mass."""
-    env = MultiAgentVectorEnv(comparison.network, num_envs=1, agents=comparison.agents)
-    env.reset(seed=comparison.first_seed)
-    return np.asarray(env.rows.stocks(env.physical.stock)[:, 0].copy())
-
-
 def _episode(
     name: str,
     network: Network,
     agents: tuple[str, ...],
-    start: Floats,
     outcome: Rollout,
     figures: Mapping[str, Aggregate | None] | None = None,
 ) -> PageEpisode:
@@ -227,7 +219,7 @@ def _episode(
         name=name,
         network=network,
         agents=agents,
-        start=start,
+        start=outcome.start,
         stock=outcome.stock,
         flow=outcome.flow,
         controls=outcome.controls,

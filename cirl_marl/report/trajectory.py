@@ -26,12 +26,11 @@ def write_trajectory(folder: Path, name: str, simulation: Simulation, title: str
     """Write ``name.csv`` and ``name.png`` of a simulated episode; return their paths.
 
     The first holds the table of the episode. The picture shows λ as a mean, as it does the flows. Of a network with
-    lifetimes ``name_ages.csv`` and ``name_ages.png`` show how old what is in use is. The environment of the simulation
-    is left at the start of the episode.
+    lifetimes ``name_ages.csv`` and ``name_ages.png`` show how old what is in use is.
     """
     network = simulation.env.network
     files = [simulation.write(folder / f"{name}.csv"), draw_trajectory(folder / f"{name}.png", simulation, title=title)]
-    if of_ages := pyramids(network, simulation.rollout, simulation.start):
+    if of_ages := pyramids(network, simulation.rollout, simulation.rollout.start):
         ages, bars = folder / f"{name}_ages.csv", folder / f"{name}_ages.png"
         write_atomically(ages, lambda draft: write_table(draft, *ages_table(network, of_ages)))
         files += [ages, save_pyramids(bars, network, of_ages, title=title)]
@@ -40,18 +39,17 @@ def write_trajectory(folder: Path, name: str, simulation: Simulation, title: str
 
 def draw_trajectory(path: Path, simulation: Simulation, *, title: str = "") -> Path:
     """Save λ, service level, stocks and flows of a simulated episode over time as a PNG; return its path."""
-    env, episode, network = simulation.env, simulation.rollout, simulation.network
-    simulation.episode_start.reset(env)
+    episode, network = simulation.rollout, simulation.network
     return save_trajectory(
         path,
-        env.network,
-        interval_ends(env.network),
+        network,
+        interval_ends(network),
         episode.stock.T,
         episode.flow.T,
         episode.circularity_mean[0],
-        start=np.concatenate([simulation.start, env.dynamics.batches.loads(env.physical.stock)[:, 0]]),
+        start=np.concatenate([episode.start, episode.start_load]),
         load=episode.load.T,
-        service=episode.service[0] if env.network.services else None,
+        service=episode.service[0] if network.services else None,
         title=title or f"{network.title or network.name}, {simulation.control}",
     )
 
