@@ -230,3 +230,47 @@ def test_the_same_agents_of_all_copies_share_a_policy(folder: Path) -> None:
         recipe("joint").groups(load_network(written(folder, definition())), ["mine"])
     with pytest.raises(RecipeError, match="among: copies is for the schemes shared and joint"):
         recipe("independent").check(100)
+
+
+def test_each_copy_is_disturbed_by_itself(folder: Path) -> None:
+    """Or all by what is common; what correlates them follows from the matrix and what regions have in common."""
+    process = f'kind = "ar1"\ndeviation = 0.2\npersistence = 0.5\nlow = 0.5\nhigh = 1.5\nunit = "1"\n{SOURCE}\n'
+    parts = f"""
+[disturbances.demand]
+{process}observed_by = ["market", "use"]
+
+[disturbances.weather]
+{process}common = true
+
+[disturbance_correlation]
+names = ["demand", "weather"]
+matrix = [[1.0, 0.4], [0.4, 1.0]]
+regions = {{ value = 0.5, {ONE} }}
+{SOURCE}
+"""
+    written(folder, COPIED + parts)
+    plain = network(folder)
+    assert not plain.disturbed and not plain.processes.names
+    wet = TEXT + '[copies.services.in_use]\nlow.disturbed_by = "weather"\n'
+    shaken = wet + '[scenarios.more.copies.arcs.ore]\nflow.disturbed_by = "demand"\n'
+    assert {path: effect.by for path, effect in network(folder, wet).disturbed.items()} == {
+        "services.japan_in_use.low": "weather",
+        "services.china_in_use.low": "weather",
+    }
+    found = network(folder, shaken, "more")
+    assert {path: effect.by for path, effect in found.disturbed.items()} == {
+        "arcs.japan_ore.flow": "japan_demand",
+        "arcs.china_ore.flow": "china_demand",
+    }
+    assert found.disturbances["china_demand"].observed_by == ("china_market", "china_use")
+    assert found.correlation.names == ("japan_demand", "china_demand", "weather")
+    assert found.correlation.matrix == ((1.0, 0.5, 0.4), (0.5, 1.0, 0.4), (0.4, 0.4, 1.0))
+    write_network(found, folder / "whole.toml")
+    again = load_network(folder / "whole.toml")
+    assert (again.disturbances, again.disturbed) == (found.disturbances, found.disturbed)
+    written(folder, COPIED + parts.replace("[0.4, 1.0]]", "[0.4, 1.0], [0.0, 0.0]]"))
+    with pytest.raises(DefinitionError, match="disturbance_correlation: needs a matrix of 2 rows of 2 numbers"):
+        network(folder, shaken, "more")
+    written(folder, COPIED + parts.replace("matrix", "matrx"))
+    with pytest.raises(DefinitionError, match=r"disturbance_correlation.matrx: .*Did you mean 'matrix'"):
+        network(folder, shaken, "more")
