@@ -40,7 +40,9 @@ from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import first_seed, rollout
 from cirl_marl.definitions.reader import write_network
 from cirl_marl.evaluation import compare
+from cirl_marl.evaluation.sampling import sample_episodes
 from cirl_marl.evaluation.statistics import worst_mean
+from cirl_marl.learners.lockstep import NetworkWorld
 from cirl_marl.network.disturbances import (
     AutoRegression,
     BlockBootstrap,
@@ -55,6 +57,8 @@ from cirl_marl.network.disturbances import (
 from cirl_marl.network.processes import Paths
 from cirl_marl.network.uncertainty import Spread, draw_network, expected_network
 from cirl_marl.optimum.mpc import MPC, Optimum
+from cirl_marl.report.page_data import page_data
+from cirl_marl.report.report_page import page_of_samples
 from cirl_marl.report.tradeoffs import summary_of, worst_notes
 
 Floats = NDArray[np.floating]
@@ -547,6 +551,10 @@ def test_the_command_shows_what_happened(tmp_path: Path) -> None:
     samples = load_network(path).processes.sample(range(first_seed(0), first_seed(0) + 5)).values[:-1]
     names = load_network(path).processes.names
     np.testing.assert_allclose([float(row["mean"]) for row in bands], samples[:, names.index("outage")].mean(axis=1))
+    data = page_data(page_of_samples(sample_episodes(load_network(path), samples=5), "neutral"))
+    assert [part["id"] for part in data["networks"][0]["disturbances"]] == [*names]
+    for i, scene in enumerate(data["scenes"][1:]):
+        np.testing.assert_allclose([part["value"] for part in scene["disturbances"]], samples[..., i].T, rtol=1e-5)
     found = [float(row["mean of disturbance record (1)"]) for row in draws]
     np.testing.assert_allclose(found, samples[:, names.index("record")].mean(axis=0))
 
@@ -580,3 +588,21 @@ def test_the_worst_episodes_are_told(tmp_path: Path) -> None:
     held = compare((), ("neutral",), network=network.with_options(episode={"horizon": 3}), episodes=3)
     entry = held.entries[0]
     assert entry.bound is not None and (entry.bound >= entry.circularity - 1e-6).all() and np.ptp(entry.bound) > 0.1
+
+
+def test_a_world_is_resumed_with_its_disturbances() -> None:
+    """From what a checkpoint keeps; one from before there were any is read where there are none."""
+    network = line(EVERYWHERE, episode=Episode(horizon=2))
+    env, other = (MultiAgentVectorEnv(network, num_envs=2) for _ in range(2))
+    world, again = (NetworkWorld(each, [seed, seed + 1], {}) for each, seed in ((env, 3), (other, 8)))
+    env.step({})
+    again.load_state_dict(world.state_dict())
+    for _ in range(4):  # past the end of the episode
+        env.step({})
+        other.step({})
+        np.testing.assert_array_equal(env.state(), other.state())
+    certain = MultiAgentVectorEnv(line({}), num_envs=2)
+    old = NetworkWorld(certain, [0, 1], {}).state_dict()
+    for name in ("processes", "disturbances"):
+        del old["state"][name]
+    NetworkWorld(MultiAgentVectorEnv(certain.network, num_envs=2), [5, 6], {}).load_state_dict(old)

@@ -191,7 +191,11 @@ def test_the_page_of_samples(tmp_path: Path) -> None:
     bottles_at(tmp_path)
     path.write_text(path.read_text().replace("rate = { value = 0.05,", 'rate = { value = 0.05, deviation = "9 %",'))
     found = sample_episodes(load_network(path), samples=5)
-    (scene,) = page_data(page_of_samples(found, "neutral"))["scenes"]
+    scene, *single = page_data(page_of_samples(found, "neutral"))["scenes"]
+    for i, draw in enumerate(single):
+        np.testing.assert_allclose(draw["lambda"]["value"], found.circularity[i], rtol=1e-5)
+        np.testing.assert_allclose(np.array(draw["flows"]).T, found.flow[i], rtol=1e-5)
+    assert len(single) == 3
     assert {values[0] for values in scene["levels"]} == {None}
     np.testing.assert_allclose(scene["lambda"]["high"], np.quantile(found.circularity, 0.975, axis=0), rtol=1e-5)
     assert scene["controls"] is None and "5 samples" in scene["about"]

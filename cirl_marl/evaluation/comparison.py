@@ -95,20 +95,15 @@ class Row:
         return over_seeds([[sample.mean() for sample in samples]])
 
     def levels(self) -> list[Aggregate]:
-        """Return the mean level of each service: of trained policies over seeds, as ``figure`` does."""
-        samples = np.array([entry.rollout.episode_levels for entry in self.entries])
-        means = [
-            over_seeds([row.mean(axis=1)]) if self.seeds else over_episodes(row[0], SHARE) for row in _last(samples)
-        ]
-        return means
+        """Return the mean level of each service: over several seeds the IQM, else over the episodes."""
+        rows = np.moveaxis(np.array([entry.rollout.episode_levels for entry in self.entries]), 2, 0)
+        return [over_seeds([row.mean(axis=1)]) if len(row) > 1 else over_episodes(row[0], SHARE) for row in rows]
 
     def worst(self) -> list[Aggregate]:
-        """Return the mean of the 5 % worst episodes of λ̄, then of the level of each service."""
+        """Return the mean of the 5 % worst episodes of λ̄, then of the level of each service, likewise."""
         figures = [np.column_stack([entry.circularity, entry.rollout.episode_levels]) for entry in self.entries]
-        return [
-            over_seeds([[worst_mean(row).value for row in rows]]) if self.seeds else worst_mean(rows[0])
-            for rows in _last(np.array(figures))
-        ]
+        tails = [[worst_mean(column) for column in of_entry.T] for of_entry in figures]
+        return [over_seeds([[t.value for t in row]]) if len(row) > 1 else row[0] for row in zip(*tails, strict=True)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,11 +131,6 @@ class Comparison:
         for entry in self.entries:
             groups.setdefault(entry.name, []).append(entry)
         return tuple(Row(name, tuple(entries)) for name, entries in groups.items())
-
-
-def _last(samples: Floats) -> Floats:
-    """Return figures of entries, shape (entries, episodes, figures), figure by figure."""
-    return np.moveaxis(samples, 2, 0)
 
 
 def compare(

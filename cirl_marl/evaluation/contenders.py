@@ -112,9 +112,14 @@ def _physics(network: Network) -> dict[str, Any]:
 
 
 def _parts(network: Network) -> dict[tuple[str, str], object]:
-    """Return compartments and services, which may share ids, by what they are and their id."""
-    parts = {("compartment", id_): compartment for id_, compartment in network.compartments.items()}
-    return parts | {("service", service.id): service for service in network.services}
+    """Return compartments, services, which may share ids, and what disturbs numbers, by what they are and their id."""
+    parts: dict[tuple[str, str], object] = {
+        ("compartment", id_): compartment for id_, compartment in network.compartments.items()
+    }
+    parts |= {("service", service.id): service for service in network.services}
+    effects = network.disturbed.items()
+    parts |= {("disturbance", path): (effect, network.disturbances[effect.by]) for path, effect in effects}
+    return parts | {("correlation", "disturbance_correlation"): network.correlation}
 
 
 def _policies(runs: Sequence[RunDirectory], uncertain: bool | None) -> Iterator[Contender]:

@@ -128,6 +128,10 @@ def _network(network: Network, episodes: Sequence[PageEpisode]) -> Values:
         "nodes": nodes,
         "arcs": arcs,
         "services": [_service(network, s, sources["services"].get(s.id, ())) for s in network.services],
+        "disturbances": [
+            {"id": name, "unit": part.unit}
+            for name, part in zip(network.processes.names, network.processes.disturbances, strict=True)
+        ],
         "settings": controls,
         "sketches": [_diagram(diagram) for diagram in flow_diagrams(network, peaks)],
     }
@@ -167,6 +171,7 @@ def _episode(episode: PageEpisode, network: int) -> Values:
         "controls": None if episode.controls is None else [_list(row) for row in episode.controls.T],
         "lambda": _band(episode.circularity),
         "services": [_band(level) for level in episode.levels],
+        "disturbances": [_band(values) for values in episode.disturbances],
         "about": episode.about,
         "figures": {name: _aggregate(figure) for name, figure in episode.figures.items() if figure is not None},
     }

@@ -25,6 +25,7 @@ from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.mpc import SERVICE_FIRST, Optimum
 from cirl_marl.report.explanations import read_reasons
+from cirl_marl.report.samples import SHOWN
 from cirl_marl.report.tradeoffs import worst_notes
 
 QUANTILES = (0.025, 0.5, 0.975)
@@ -59,6 +60,7 @@ class PageEpisode:
     figures: Annotated[Mapping[str, Aggregate | None], "figures of whole episodes, of ``comparison.FIGURES``"] = field(
         default_factory=dict
     )
+    disturbances: Annotated[tuple[Band, ...], "values of each disturbance"] = ()
 
 
 @positional_record
@@ -97,7 +99,10 @@ def page_of_alternatives(simulations: Sequence[Simulation]) -> ReportPage:
 
 
 def page_of_samples(samples: SampledEpisodes, control: str) -> ReportPage:
-    """Return the page of ``cirl simulate --samples``: flows and stocks are means, which balance as medians do not."""
+    """Return the page of ``cirl simulate --samples``, with single ones beside their bands.
+
+    Flows and stocks are means, which balance as medians do not.
+    """
     network, count = samples.network, len(samples.circularity)
     episode = PageEpisode(
         name=readable(control),
@@ -110,9 +115,23 @@ def page_of_samples(samples: SampledEpisodes, control: str) -> ReportPage:
         circularity=_quantiles(samples.circularity),
         levels=tuple(_quantiles(samples.levels[:, s]) for s in range(len(network.services))),
         about=SAMPLES.format(count),
+        disturbances=tuple(map(_quantiles, np.moveaxis(samples.disturbances, 2, 0))),
+    )
+    draws = tuple(
+        replace(
+            episode,
+            name=f"sample {i}",
+            stock=samples.stock[i],
+            flow=samples.flow[i],
+            circularity=Band(samples.circularity[i]),
+            levels=tuple(map(Band, samples.levels[i])),
+            about="",
+            disturbances=tuple(map(Band, samples.disturbances[i].T)),
+        )
+        for i in range(min(SHOWN, count))
     )
     note = f"Flows and stocks are means of {count} samples of what is uncertain or disturbed."
-    return ReportPage(_title(network), network, (episode,), notes=(note,))
+    return ReportPage(_title(network), network, (episode, *draws), notes=(note,))
 
 
 def page_of_schedule(schedule: Schedule) -> ReportPage:
@@ -227,6 +246,7 @@ def _episode(
         levels=tuple(_mean(outcome.levels[:, s], 1.0) for s in range(len(network.services))),
         about=CONFIDENCE.format(count) if count > 1 else "",
         figures=figures,
+        disturbances=tuple(_mean(values, np.inf) for values in np.moveaxis(outcome.disturbances, 2, 0)),
     )
 
 

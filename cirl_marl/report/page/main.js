@@ -158,6 +158,11 @@ function curves() {
     const pick = (scene) => scene.services[story.networks[scene.network].services.findIndex((each) => each.id === id)];
     panels.push(panelOf(host, { title: `Service: ${label}`, share: true, lines: of(pick), limits: [0.95, 1], labels, go }));
   }
+  const units = new Map(story.networks.flatMap((network) => network.disturbances.map((each) => [each.id, each.unit])));
+  for (const [id, unit] of units) {
+    const pick = (scene) => scene.disturbances[story.networks[scene.network].disturbances.findIndex((each) => each.id === id)];
+    panels.push(panelOf(host, { title: `Disturbance: ${id.replaceAll("_", " ")}`, unit, lines: of(pick), labels, go }));
+  }
   const plan = story.scenes.find((scene) => scene.plan);
   if (plan && story.scenes.length > 1) {
     const less = (values) => values?.map((value, t) => (value === null ? null : plan.lambda.value[t] - value));

@@ -8,12 +8,13 @@ const GROUPS = { circularity: "Circularity and service", stock: "Stocks and thro
 
 /** Every quantity of a scene: its kind, id, name, unit and values, one for each step, and at step 0 where there is one. */
 export function quantitiesOf(story, scene) {
-  const { nodes, arcs, services, settings } = story.networks[scene.network];
+  const { nodes, arcs, services, disturbances, settings } = story.networks[scene.network];
   const flow = `${story.mass}/${story.time}`;
   const of = (kind, id, name, unit, band) => ({ kind, id, name, unit, ...band, first: 1 });
   return [
     of("circularity", "", "λ, mean of the interval", story.mass, scene.lambda),
     ...services.map((each, s) => of("service", each.id, `service: ${each.label}`, "1", scene.services[s])),
+    ...disturbances.map((each, n) => of("disturbance", each.id, `disturbance: ${each.id}`, each.unit, scene.disturbances[n])),
     ...nodes.map((node, i) => {
       const about = node.stores ? ["stock", story.mass] : ["throughput", flow];
       return { ...of(about[0], node.id, node.label, about[1], { value: scene.levels[i] }), first: node.stores ? 0 : 1 };
@@ -82,7 +83,7 @@ export function figuresOf(story, file) {
   const pick = make("select", { id: "kind" }, ...Object.entries(GROUPS).map(([value, name]) => make("option", { value }, name)));
   part("tools").append(make("label", { for: "kind" }, "Show "), pick, save);
   const found = story.scenes.map((scene) => new Map(quantitiesOf(story, scene).map((each) => [`${each.kind} ${each.id} ${each.name}`, each])));
-  const kinds = { circularity: ["circularity", "service"], stock: ["stock", "throughput"], flow: ["flow"], control: ["control"] };
+  const kinds = { circularity: ["circularity", "service", "disturbance"], stock: ["stock", "throughput"], flow: ["flow"], control: ["control"] };
   let last = 1;
   const fill = (step) => {
     last = step;
