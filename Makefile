@@ -51,7 +51,7 @@ docs: $(VENV)/.docs  ## the documents as a site in build/site; what is broken or
 notebooks: $(VENV)/.docs  ## run the notebooks whose scripts have changed and keep what comes out (minutes each)
 	$(BIN)/python -m docs.site.notebooks
 
-written: $(VENV)/.runtime  ## the JSON schema of networks, docs/format.md and tables of docs/reference.md, from the code
+written: $(VENV)/.runtime  ## the JSON schemas of networks and recipes, docs/format.md and tables of docs/reference.md, from the code
 	$(BIN)/python -m docs.site.format_guide
 	$(BIN)/python -m docs.site.reference
 

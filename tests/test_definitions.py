@@ -29,9 +29,9 @@ from cirl_marl import (
 )
 from cirl_marl.definitions.catalogue import folder
 from cirl_marl.definitions.reader import Definition, write_network
-from cirl_marl.definitions.schema import json_schema
 from cirl_marl.network.elements import ControlKind
 from cirl_marl.records import files
+from docs.site.schemas import network_schema
 
 FILES = sorted(folder("envs").glob("*.toml"))
 COPPER = (Path(__file__).parent / "reference" / "definition.toml").read_text(encoding="utf-8")
@@ -68,15 +68,15 @@ def test_sizes(name: str) -> None:
 
 
 def test_schema_is_up_to_date() -> None:
-    """The published schema is the one that the code implies; json_schema() writes it anew."""
+    """The published schema is the one that the code implies; network_schema() writes it anew."""
     published = (folder("envs") / "network.schema.json").read_text(encoding="utf-8")
-    assert published == json.dumps(json_schema(), indent=2, ensure_ascii=False) + "\n"
+    assert published == json.dumps(network_schema(), indent=2, ensure_ascii=False) + "\n"
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_files_pass_the_schema(path: Path) -> None:
     """Editors accept what the library accepts."""
-    schema = json_schema()
+    schema = network_schema()
     jsonschema.Draft202012Validator.check_schema(schema)
     jsonschema.validate(tomllib.loads(path.read_text(encoding="utf-8")), schema)
 
@@ -85,7 +85,7 @@ def test_schema_refuses_what_the_library_refuses() -> None:
     """A misspelt key, also inside a scenario, is underlined."""
     for old, new in (("rate = { value = 0.82", "rat = { value = 0.82"), ("tracked = [", "trakced = [")):
         with pytest.raises(jsonschema.ValidationError):
-            jsonschema.validate(tomllib.loads(COPPER.replace(old, new)), json_schema())
+            jsonschema.validate(tomllib.loads(COPPER.replace(old, new)), network_schema())
 
 
 def initial_circularity(name: str, scenario: str) -> tuple[dict[str, float], float]:

@@ -17,7 +17,8 @@ from cirl_marl import CirlError, DefinitionError, MultiAgentVectorEnv, RecipeErr
 from cirl_marl.definitions.catalogue import folder
 from cirl_marl.learners.algorithms import algorithms, parameter_mistakes, parameters_of
 from cirl_marl.learners.interface import train
-from cirl_marl.learners.recipe import LearnerSettings, Match, Normalisation, Options, Recipe, load_recipe, recipe_schema
+from cirl_marl.learners.recipe import LearnerSettings, Match, Normalisation, Options, Recipe, load_recipe
+from docs.site.schemas import recipe_schema
 
 GOOD = """
 name = "mine"

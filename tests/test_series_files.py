@@ -12,9 +12,9 @@ import pytest
 from series_definition import CONSTANT, HALF, SOURCE, column, definition, written
 
 from cirl_marl import DefinitionError, Series, load_network
-from cirl_marl.definitions.schema import json_schema
 from cirl_marl.network import Network
 from cirl_marl.network.split_fractions import splits
+from docs.site.schemas import network_schema
 
 SHARED = f'control = {{ kind = "share", low = 0.1, neutral = 0.5, high = 0.9, unit = "1", {SOURCE} }}'
 
@@ -27,7 +27,7 @@ def inline(keys: str) -> str:
 def read(folder: Path, text: str) -> Network:
     """Read a definition that lies beside its data; editors, too, must take it."""
     document = json.loads(json.dumps(tomllib.loads(text), default=str))
-    jsonschema.validate(document, json_schema())
+    jsonschema.validate(document, network_schema())
     return load_network(written(folder, text))
 
 

@@ -123,8 +123,8 @@ class SeriesTable(AmountSeries, StatedTable):
     source: Source
 
 
-class AmountColumn(Table):
-    """Numbers of a CSV file, in the unit of the table in which they stand; a single one if they have no times."""
+class RecordColumn(Table):
+    """Numbers of a column of a CSV file, in the order of its rows and in the unit of the table in which they stand."""
 
     file: str = Field(description="name of the file, which lies in the folder of the definition or below it")
     column: str = Field(description="the column with the numbers")
@@ -134,17 +134,13 @@ class AmountColumn(Table):
     times: str | None = Field(
         None, description="the column with the times; default: ``year``, if there is one that ``where`` leaves free"
     )
+
+
+class AmountColumn(RecordColumn):
+    """Numbers of a CSV file, in the unit of the table in which they stand; a single one if they have no times."""
+
     interpolation: Interpolation = "step"
     time_unit: TimeUnit = None
-
-
-class RecordColumn(Table):
-    """Numbers of a column of a CSV file, in the order of its rows and in the unit of the table in which they stand."""
-
-    file: str = Field(description="name of the file, which lies in the folder of the definition or below it")
-    column: str = Field(description="the column with the numbers")
-    where: dict[str, str] = Field({}, description="texts by which rows are chosen, by column, as of a quantity")
-    times: str | None = Field(None, description="the column with the times, likewise")
 
 
 class ColumnTable(AmountColumn, StatedTable):

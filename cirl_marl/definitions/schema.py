@@ -252,36 +252,3 @@ class NetworkTable(Table):
         description="tables that replace those of the default scenario, key by key, after those named in 'without', "
         "such as 'nodes.digester.model', are left out",
     )
-
-
-def json_schema() -> dict[str, Any]:
-    """Return the JSON schema of definition files, with which editors complete and check them.
-
-    A scenario may give any part of a network, so in its branch nothing is required.
-    """
-    schema = NetworkTable.model_json_schema(by_alias=True)
-    definitions = schema["$defs"]
-
-    def part(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {
-                key: f"{item}Part" if key == "$ref" and item.split("/")[-1] in tables else part(item)
-                for key, item in value.items()
-                if not (key == "required" and isinstance(item, list))
-            }
-        return [part(item) for item in value] if isinstance(value, list) else value
-
-    tables = [name for name, body in definitions.items() if body.get("type") == "object"]
-    parts = {f"{name}Part": part(definitions[name]) for name in tables}
-    properties = {k: v for k, v in schema["properties"].items() if k not in ("scenarios", "regions", "name")}
-    without = {"type": "array", "items": {"type": "string"}, "description": "what to leave out first, as dotted paths"}
-    parts["Scenario"] = {
-        "type": "object",
-        "additionalProperties": False,
-        "properties": {"without": without, **part(properties)},
-    }
-    definitions.update(parts)
-    scenarios = schema["properties"]["scenarios"]["patternProperties"]
-    scenarios.update({pattern: {"$ref": "#/$defs/Scenario"} for pattern in scenarios})
-    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
-    return schema

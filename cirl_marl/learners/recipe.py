@@ -310,17 +310,6 @@ class Recipe(Settings):
         return ("learner", self.learner), *((f"match.{i}", match) for i, match in enumerate(self.match))
 
 
-def recipe_schema() -> dict[str, Any]:
-    """Return the JSON schema of recipe files, with which editors complete and check them."""
-    from cirl_marl.learners.algorithms import algorithms
-
-    schema = Recipe.model_json_schema()
-    for table in ("LearnerSettings", "Match"):
-        schema["$defs"][table]["properties"]["algorithm"]["enum"] = list(algorithms())
-    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
-    return schema
-
-
 def load_recipe(name: str | Path) -> Recipe:
     """Read a recipe of the catalogue, or of a file if ``name`` ends in ``.toml``.
 

@@ -1,11 +1,10 @@
 """The fields of the file format as a document, from their declarations: ``python -m docs.site.format_guide``.
 
-Writes ``docs/format.md`` and the schema of definition files, with which editors complete and check them.
+Writes ``docs/format.md`` and the schemas of files.
 """
 
 from __future__ import annotations
 
-import json
 import textwrap
 from typing import Any, get_args
 
@@ -14,6 +13,7 @@ from pydantic.fields import FieldInfo
 
 from cirl_marl.definitions import quantities, schema
 from docs.site.markdown import ROOT
+from docs.site.schemas import write_schemas
 
 PARTS: dict[str, tuple[Any, str]] = {
     "network": (schema.NetworkTable, "The file itself"),
@@ -74,5 +74,4 @@ def _wrap(line: str, indent: int = 2) -> str:
 
 if __name__ == "__main__":
     (ROOT / "docs" / "format.md").write_text(format_guide(), encoding="utf-8")
-    schema_ = json.dumps(schema.json_schema(), indent=2, ensure_ascii=False) + "\n"
-    (ROOT / "envs" / "network.schema.json").write_text(schema_, encoding="utf-8")
+    write_schemas()
