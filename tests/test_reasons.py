@@ -19,7 +19,7 @@ from pages import shown
 import cirl_marl
 from cirl_marl import CirlError, MultiAgentVectorEnv, Network, RunError, load_network
 from cirl_marl.controllers.basic import Arrays
-from cirl_marl.controllers.rollout import first_seed
+from cirl_marl.controllers.rollout import first_seed, rollout
 from cirl_marl.evaluation.assessment import evaluate
 from cirl_marl.learners.interface import Trained, train
 from cirl_marl.learners.policies import DifferentiablePolicy, Policies, Policy
@@ -29,7 +29,7 @@ from cirl_marl.reasons import extras
 from cirl_marl.reasons.attribution import _memories, attribute_inputs
 from cirl_marl.reasons.explanation import explain
 from cirl_marl.reasons.input_signals import policy_columns, signal_of
-from cirl_marl.reasons.interventions import Recorder, play_episodes
+from cirl_marl.reasons.interventions import Recorder
 from cirl_marl.reasons.rules import distil_rules
 from cirl_marl.reasons.sentences import input_sentence, rule_sentences
 from cirl_marl.report.explanations import read_reasons, write_reasons
@@ -77,7 +77,7 @@ def test_a_linear_policy_is_attributed_exactly() -> None:
     known = {"use_to_collection": lambda seen: (seen @ torch.as_tensor(weights, dtype=seen.dtype))[:, None]}
     policies, watching = Known(env, known), None
     watching = Recorder(policies)
-    usual = play_episodes(env, watching, FIRST)
+    usual = rollout(env, watching, seed=FIRST)
     found, other = attribute_inputs(env, policies, policies, watching.episodes, usual, FIRST, top=3)
     seen = watching.episodes.observations["use_to_collection"].reshape(-1, size)
     sizes = np.abs(weights * (seen - seen.mean(axis=0))).mean(axis=0)
@@ -116,7 +116,7 @@ def test_a_rule_is_found_again() -> None:
         return torch.where(late & full, 1.0, -1.0)[:, None]
 
     policies = Known(env, {"use_to_collection": opens})
-    usual = play_episodes(env, policies, FIRST)
+    usual = rollout(env, policies, seed=FIRST)
     found = distil_rules(env, policies, usual, FIRST, leaves=4)
     rule, idle = found.rules
     assert rule.explained_variance > 0.99 and idle.explained_variance == 1.0
@@ -181,7 +181,7 @@ def test_every_kind_of_policy_is_differentiated(tmp_path: Path, kind: str) -> No
     policies = Trained(learnt(tmp_path, kind))
     env = policies.run.make_env(3)
     watching = Recorder(policies)
-    usual = play_episodes(env, watching, FIRST)
+    usual = rollout(env, watching, seed=FIRST)
     seen = watching.episodes
     for agent in env.agents:
         name, policy = next(each for each in policies.policies.items() if agent in each[1].view.agents)

@@ -1,4 +1,4 @@
-"""Controllers that need no learning: neutral, constant and random, and one that tells how far another is."""
+"""Controllers that need no learning: neutral, constant and random."""
 
 from __future__ import annotations
 
@@ -91,38 +91,3 @@ class Random(Controller):
         """Return fresh random actions."""
         del observations
         return {agent: self._random.uniform(-1.0, 1.0, shape) for agent, shape in self._shapes.items()}
-
-
-class ProgressController(Controller):
-    """A controller that tells how far its episode is: its plans, if it is a planner, and what it has carried out.
-
-    >>> from cirl_marl.controllers import Neutral
-    >>> from cirl_marl.controllers.rollout import rollout
-    >>> shares = []
-    >>> watched = ProgressController(Neutral(), shares.append)
-    >>> _ = rollout(MultiAgentVectorEnv("net_zero", num_envs=1, horizon=2), watched, progress=watched.report_steps)
-    >>> shares
-    [0.5, 1.0]
-    """
-
-    def __init__(self, controller: Controller, progress: Callable[[float], None]) -> None:
-        """Take who acts, and what is called with the share of the episode's work that is done."""
-        self._controller, self._progress = controller, progress
-        self._ahead, self._steps = 0.0, 1
-
-    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
-        """Start the controller, and tell how far its plans are."""
-        self._ahead, self._steps = 0.0, env.network.episode.horizon
-        if isinstance(self._controller, Planner):
-            ahead = self._ahead = self._controller.ahead
-            self._controller.plan(env, seed, lambda share: self._progress(ahead * share))
-        else:
-            self._controller.start(env, seed)
-
-    def act(self, observations: Arrays) -> Arrays:
-        """Return the controller's actions."""
-        return self._controller.act(observations)
-
-    def report_steps(self, intervals: int) -> None:
-        """Tell that so many intervals are done; ``rollout`` takes this as its ``progress``."""
-        self._progress(self._ahead + (1.0 - self._ahead) * intervals / self._steps)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import numpy as np
 
-from cirl_marl.controllers.basic import Arrays, Controller
+from cirl_marl.controllers.basic import Arrays, Controller, Planner
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
@@ -86,19 +86,31 @@ def rollout(
     *,
     seed: int = EVALUATION_SEEDS,
     start: Mapping[str, float] | None = None,
-    progress: Callable[[int], None] | None = None,
+    progress: Callable[[float], None] = lambda share: None,
+    watch: Callable[[int], None] = lambda intervals: None,
 ) -> Rollout:
     """Run one whole episode in every copy of ``env``, of which copy i is reset with ``seed + i``.
 
     The same seed gives every controller the same start states; what stands in ``start`` is not drawn (see
-    ``MultiAgentVectorEnv.reset``). ``progress`` is called with the number of intervals done.
+    ``MultiAgentVectorEnv.reset``). ``progress`` is called with the share of the work that is done, plans that a
+    controller makes beforehand included, and ``watch`` with the number of intervals done.
+
+    >>> from cirl_marl.controllers import Neutral
+    >>> shares = []
+    >>> _ = rollout(MultiAgentVectorEnv("net_zero", num_envs=1, horizon=2), Neutral(), progress=shares.append)
+    >>> shares
+    [0.5, 1.0]
     """
     observations = env.reset(seed=seed, options={"initial_state": start or {}})
     steps, rows, batches, physics = env.network.episode.horizon, env.rows, env.dynamics.batches, env.dynamics.inner
     before = env.physical
     stocks, loads = (masses(before.stock)[:, 0].copy() for masses in (rows.stocks, batches.loads))
     origin = (stocks, loads, before.inner[physics.visible, 0].copy())
-    controller.start(env, seed)
+    ahead = controller.ahead if isinstance(controller, Planner) else 0.0
+    if isinstance(controller, Planner):
+        controller.plan(env, seed, lambda share: progress(ahead * share))
+    else:
+        controller.start(env, seed)
     circularity, mean, service = np.empty((3, env.num_envs, steps))
     levels = np.empty((env.num_envs, len(env.network.services), steps))
     local, returns = np.zeros((2, len(env.agents), env.num_envs))
@@ -124,8 +136,8 @@ def rollout(
         load[t], inner[t] = batches.loads(env.physical.stock)[:, 0], env.physical.inner[physics.visible, 0]
         total_flow += outcome.flow.mean(axis=1)
         observations = env.by_agent(outcome.observation)
-        if progress is not None:
-            progress(t + 1)
+        watch(t + 1)
+        progress(ahead + (1.0 - ahead) * (t + 1) / steps)
     shortage *= env.network.episode.control_interval
     final = rows.stocks(env.physical.stock).mean(axis=1)
     flows = total_flow / steps

@@ -63,14 +63,14 @@ def schedule(
     controller: Controller,
     *,
     seed: int | None = None,
-    progress: Callable[[int], None] | None = None,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> Schedule:
     """Run one episode and tabulate it, a row for each control interval.
 
     Columns are when the interval begins and ends, the value of every control in it, the mass that an agent with a valve
     lets through, λ at its end and its mean over it, and the service level.
 
-    It begins at ``episode_start(env, seed)``. ``progress`` is called with the number of intervals done.
+    It begins at ``episode_start(env, seed)``. ``progress`` is called with the share that is done.
 
     Raises:
         CirlError: if the controller does not fit the network, nobody acts, or there are several copies.

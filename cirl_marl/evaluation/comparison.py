@@ -10,7 +10,6 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cirl_marl.controllers.basic import ProgressController
 from cirl_marl.controllers.rollout import Rollout, first_seed, rollout
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
@@ -192,8 +191,8 @@ def compare(
     for place, contender in enumerate(candidates):
         controller = contender.controller()
         checkpoints.append(controller.checkpoint.name if isinstance(controller, Trained) else "")
-        reporter = ProgressController(controller, part_of(progress, contender.name, place * share, share))
-        rollouts.append(rollout(contender.env(episodes), reporter, seed=first, progress=reporter.report_steps))
+        report = part_of(progress, contender.name, place * share, share)
+        rollouts.append(rollout(contender.env(episodes), controller, seed=first, progress=report))
     baseline = Baseline()
     bounds_by_entry: list[Floats | None] = [None] * len(candidates)
     if bounds:

@@ -9,7 +9,6 @@ from pathlib import Path
 from numpy.typing import ArrayLike
 
 from cirl_marl.controllers import Controller
-from cirl_marl.controllers.basic import ProgressController
 from cirl_marl.controllers.schedule import Schedule, schedule
 from cirl_marl.definitions.catalogue import file_and_region, networks
 from cirl_marl.environments.vector import MultiAgentVectorEnv
@@ -53,8 +52,7 @@ def plan(
         RunError: if the run is incomplete.
     """
     env, controller = _environment_and_controller(source, control, scenario, min_service)
-    reporter = ProgressController(controller, progress)
-    table = schedule(env, reporter, seed=seed, progress=reporter.report_steps)
+    table = schedule(env, controller, seed=seed, progress=progress)
     name = type(control).__name__ if isinstance(control, Controller) else control or ""
     return replace(table, control=name, note=controller.note)
 

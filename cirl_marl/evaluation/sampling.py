@@ -72,16 +72,16 @@ def sample_episodes(
         raise CirlError(f"samples must be at least 2, got {samples}")
     # without disturbances something has to be uncertain, or there is nothing to draw
     env = MultiAgentVectorEnv(network, num_envs=samples, uncertain=bool(network.uncertain) or not network.disturbed)
-    start_state, horizon = episode_start(env), network.episode.horizon
+    horizon = network.episode.horizon
     stock = np.empty((samples, horizon, len(network.stores)))
     flow = np.empty((samples, horizon, len(network.arcs)))
 
     def keep(steps: int) -> None:
         stock[:, steps - 1] = env.rows.stocks(env.physical.stock).T
         flow[:, steps - 1] = env.physical.flow.T
-        progress(steps / horizon)
 
-    run = rollout(env, named_controller(control), seed=first_seed(seed), start=start_state.initial_state, progress=keep)
+    first, middle = first_seed(seed), episode_start(env).initial_state
+    run = rollout(env, named_controller(control), seed=first, start=middle, progress=progress, watch=keep)
     factors = env.physical.factors.T.copy()
     names, outcome = tuple(network.uncertain), (run.circularity_mean, run.levels, stock, flow, run.disturbances)
     return SampledEpisodes(network, names, factors, *outcome)

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import numpy as np
 
-from cirl_marl.controllers.basic import Controller, ProgressController
+from cirl_marl.controllers.basic import Controller
 from cirl_marl.controllers.outcome import outcome_lines
 from cirl_marl.controllers.pyramids import pyramids
 from cirl_marl.controllers.rollout import EpisodeStart, Rollout, episode_start, interval_ends, rollout
@@ -185,9 +185,9 @@ def simulate_alternatives(
     for i, ((env, control), controller) in enumerate(zip(cases, controllers, strict=True)):
         choices = ((env.network.scenario_name, envs), (control, names))
         name = ", ".join(choice for choice, among in choices if len(among) > 1)
-        reporter = ProgressController(controller, partial(_tell, progress, i, len(cases)))
+        report = partial(_tell, progress, i, len(cases))
         try:
-            simulations.append(_run(name, control, env, reporter, seed))
+            simulations.append(_run(name, control, env, controller, seed, report))
         except CirlError as error:
             if not name:
                 raise
@@ -222,11 +222,16 @@ def _refuse(
 
 
 def _run(
-    name: str, control: str, env: MultiAgentVectorEnv, reporter: ProgressController, seed: int | None
+    name: str,
+    control: str,
+    env: MultiAgentVectorEnv,
+    controller: Controller,
+    seed: int | None,
+    progress: Callable[[float], None],
 ) -> Simulation:
-    start_state = episode_start(env, seed)
-    run = rollout(env, reporter, seed=start_state.seed, start=start_state.initial_state, progress=reporter.report_steps)
-    return Simulation(name, control, env, start_state, run)
+    origin = episode_start(env, seed)
+    run = rollout(env, controller, seed=origin.seed, start=origin.initial_state, progress=progress)
+    return Simulation(name, control, env, origin, run)
 
 
 def _tell(progress: Callable[[float], None], done: int, of: int, share: float) -> None:

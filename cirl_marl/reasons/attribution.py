@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from cirl_marl.controllers.rollout import Rollout
+from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.evaluation.statistics import Aggregate, over_episodes
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import frozen_record
 from cirl_marl.reasons.extras import module_for
 from cirl_marl.reasons.input_signals import Signal, observation_entries, policy_columns, signal_of
-from cirl_marl.reasons.interventions import FixedInputs, RecordedEpisodes, Substitution, play_episodes
+from cirl_marl.reasons.interventions import FixedInputs, RecordedEpisodes, Substitution
 
 if TYPE_CHECKING:
     from cirl_marl.learners.policies import Policies, Policy
@@ -104,7 +104,7 @@ def attribute_inputs(
             entries = observation_entries(env, member, names)
             constants[member] = entries, record.observations[member].mean(axis=(0, 1))[entries]
         controller = Substitution(policies, FixedInputs(twins, constants), [agent])
-        return paired_difference(play_episodes(env, controller, seed), usual)
+        return paired_difference(rollout(env, controller, seed=seed), usual)
 
     attributions = []
     for place, agent in enumerate(env.agents):

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from cirl_marl.controllers.rollout import first_seed
+from cirl_marl.controllers.rollout import first_seed, rollout
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.evaluation.baselines import levels_to_demand
@@ -21,7 +21,7 @@ from cirl_marl.network.declarations import frozen_record
 from cirl_marl.optimum import NoCertificate
 from cirl_marl.reasons import extras
 from cirl_marl.reasons.attribution import AgentInputs, attribute_inputs
-from cirl_marl.reasons.interventions import Recorder, play_episodes
+from cirl_marl.reasons.interventions import Recorder
 from cirl_marl.reasons.prices import ShadowPrices, shadow_prices
 from cirl_marl.reasons.rules import LEAVES, TeamRules, distil_rules
 
@@ -124,7 +124,7 @@ def _explain_run(
         return part_of(progress, name, next(steps) * share, share)
 
     recorder = Recorder(policies)
-    usual = play_episodes(env, recorder, seed, report("episodes"))
+    usual = rollout(env, recorder, seed=seed, progress=report("episodes"))
     explanation = Explanation(
         network=env.network, about=str(run.path), checkpoint=policies.checkpoint.name, episodes=episodes
     )

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
 from cirl_marl.controllers.basic import Arrays, Controller
-from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import RunError
 from cirl_marl.network import Floats, Integers
@@ -112,14 +111,3 @@ class Substitution(Controller):
         """Return each agent's action by whoever acts for it."""
         actions, substitutes = self.controller.act(observations), self.substitute.act(observations)
         return {**actions, **{agent: substitutes[agent] for agent in self.agents}}
-
-
-def play_episodes(
-    env: MultiAgentVectorEnv,
-    controller: Controller,
-    seed: int,
-    progress: Callable[[float], None] = lambda share: None,
-) -> Rollout:
-    """Return the episodes of a controller from the starts of a seed."""
-    steps = env.network.episode.horizon
-    return rollout(env, controller, seed=seed, progress=lambda step: progress(step / steps))

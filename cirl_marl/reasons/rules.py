@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 
 from cirl_marl.controllers.basic import Arrays, Controller
-from cirl_marl.controllers.rollout import Rollout
+from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import frozen_record, positional_record
 from cirl_marl.reasons.attribution import PairedDifference, paired_difference
 from cirl_marl.reasons.extras import module_for
 from cirl_marl.reasons.input_signals import PolicyColumns, Signal, policy_columns, signal_of
-from cirl_marl.reasons.interventions import RecordedEpisodes, Recorder, Substitution, play_episodes
+from cirl_marl.reasons.interventions import RecordedEpisodes, Recorder, Substitution
 
 if TYPE_CHECKING:
     from cirl_marl.learners.policies import Policies
@@ -152,7 +152,7 @@ def distil_rules(
     for round_ in range(ROUNDS + 1):
         recorder = Recorder(policies, controller if round_ else None)
         # starts between those of one evaluation and the next are nobody's
-        play_episodes(env, recorder, seed + (round_ + 1) * 100_000)
+        rollout(env, recorder, seed=seed + (round_ + 1) * 100_000)
         records.append(recorder.episodes)
         lessons = {agent: _lessons(agent, columns[agent], records) for agent in env.agents}
         fitted_trees = {agent: _fit(lessons[agent], leaves) for agent in env.agents}
@@ -160,7 +160,7 @@ def distil_rules(
         progress((round_ + 1) / work)
     rules = []
     for a, agent in enumerate(env.agents):
-        episodes = play_episodes(env, Substitution(policies, controller, [agent]), seed)
+        episodes = rollout(env, Substitution(policies, controller, [agent]), seed=seed)
         tree, lesson = fitted_trees[agent], lessons[agent]
         rules.append(
             Rule(
@@ -171,7 +171,7 @@ def distil_rules(
             )
         )
         progress((ROUNDS + 2 + a) / work)
-    together = paired_difference(play_episodes(env, controller, seed), usual)
+    together = paired_difference(rollout(env, controller, seed=seed), usual)
     progress(1.0)
     return TeamRules(rules=tuple(rules), together=together)
 

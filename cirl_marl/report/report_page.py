@@ -9,7 +9,6 @@ from typing import Annotated
 import numpy as np
 from scipy.special import stdtrit
 
-from cirl_marl.controllers.basic import ProgressController
 from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.controllers.schedule import Schedule
 from cirl_marl.drawing.style import readable
@@ -186,8 +185,7 @@ def add_plan(
     """
     level = None if env.dynamics.factors.ranges else levels_to_demand(comparison.entries[0].rollout.episode_levels[0])
     optimum = Optimum(min_service=level, service_weight=SERVICE_FIRST if level is None else None)
-    controller = ProgressController(optimum, progress)
-    outcome = rollout(env, controller, seed=comparison.first_seed, progress=controller.report_steps)
+    outcome = rollout(env, optimum, seed=comparison.first_seed, progress=progress)
     episode = _episode(PLAN, comparison.network, comparison.agents, outcome)
     service, circularity = float(outcome.least_service[0]), float(outcome.episode_circularity[0])
     point = PlanePoint(PLAN, service, circularity, "of the first episode")
