@@ -185,13 +185,14 @@ def simulate_alternatives(
     for i, ((env, control), controller) in enumerate(zip(cases, controllers, strict=True)):
         choices = ((env.network.scenario_name, envs), (control, names))
         name = ", ".join(choice for choice, among in choices if len(among) > 1)
-        report = partial(_tell, progress, i, len(cases))
+        origin, report = episode_start(env, seed), partial(_tell, progress, i, len(cases))
         try:
-            simulations.append(_run(name, control, env, controller, seed, report))
+            run = rollout(env, controller, seed=origin.seed, start=origin.initial_state, progress=report)
         except CirlError as error:
             if not name:
                 raise
             raise CirlError(f"{name}: {error}") from error
+        simulations.append(Simulation(name, control, env, origin, run))
     return simulations
 
 
@@ -219,19 +220,6 @@ def _refuse(
             raise CirlError(
                 f"network '{env.network.name}': scenarios {pair} cannot be compared: {'; '.join(obstacles)}"
             )
-
-
-def _run(
-    name: str,
-    control: str,
-    env: MultiAgentVectorEnv,
-    controller: Controller,
-    seed: int | None,
-    progress: Callable[[float], None],
-) -> Simulation:
-    origin = episode_start(env, seed)
-    run = rollout(env, controller, seed=origin.seed, start=origin.initial_state, progress=progress)
-    return Simulation(name, control, env, origin, run)
 
 
 def _tell(progress: Callable[[float], None], done: int, of: int, share: float) -> None:

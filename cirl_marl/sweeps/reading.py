@@ -9,7 +9,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BeforeValidator, Field, StrictBool, StrictInt, StrictStr, ValidationError
 from pydantic_core import PydanticCustomError
 
-from cirl_marl.definitions.catalogue import file_and_region, load_network, networks, recipes
+from cirl_marl.definitions.catalogue import file_and_region, load_network
 from cirl_marl.definitions.error_messages import validation_mistakes
 from cirl_marl.definitions.quantities import Number
 from cirl_marl.definitions.reader import read_toml
@@ -109,28 +109,20 @@ def _from(folder: Path, name: str) -> str:
 
 def _unknown_names(sound: Mapping[str, Sequence[str]]) -> Iterator[str]:
     """Yield what is wrong with networks, scenarios and recipes, each by itself."""
-    unknown_names: list[Network] = []
-    for key, read, names in (("networks", load_network, networks), ("recipes", load_recipe, recipes)):
+    readers: dict[str, Callable[[str], Network | Recipe]] = {"networks": load_network, "recipes": load_recipe}
+    networks: list[Network] = []
+    for key, read in readers.items():
         for name in sound.get(key, ()):
             try:
-                candidate = _read(read, names, key[:-1], name)
+                candidate = read(name)
             except DefinitionError as error:
                 yield from (f"{key}: {problem}" for problem in str(error).splitlines())
             except CirlError as error:
                 yield f"{key}: {error}"
             else:
-                unknown_names += [candidate] if isinstance(candidate, Network) else []
-    for network in unknown_names:
+                networks += [candidate] if isinstance(candidate, Network) else []
+    for network in networks:
         present = [network.scenario_name, *network.scenarios]
         for name in sound.get("scenarios", ()):
             if name not in present:
                 yield f"scenarios: network '{network.name}': {unknown_name('scenario', name, present)}"
-
-
-def _read(
-    read: Callable[[str], Network | Recipe], names: Callable[[], list[str]], kind: str, name: str
-) -> Network | Recipe:
-    """Read a network or recipe; one without a name at all is refused in the same words as an unknown one."""
-    if not name.strip():
-        raise CirlError(unknown_name(kind, name, names()))
-    return read(name)
