@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
@@ -242,6 +243,7 @@ def disturbed_networks(draw: st.DrawFn) -> Network:
     return network.with_options(episode={} if step is None else {"solver_step": interval / round(3 * interval / step)})
 
 
+@pytest.mark.medium
 @given(disturbed_networks(), st.integers(0, 99))
 def test_a_disturbed_network_is_the_network_of_its_path(network: Network, seed: int) -> None:
     """Simulated with series of what came; mass is kept, no stock negative; batch = lone, and back is as before."""
@@ -528,6 +530,7 @@ def test_supplies_and_difference_rewards_meet_the_same_disturbances() -> None:
             np.testing.assert_allclose(ours.returns[:, i], alone.returns[:, i], atol=1e-9)
 
 
+@pytest.mark.medium
 def test_the_command_shows_what_happened(tmp_path: Path) -> None:
     """Values of each interval in the table of an episode; bands of them, and means of draws, of many."""
     path = tmp_path / "line.toml"
@@ -542,6 +545,8 @@ def test_the_command_shows_what_happened(tmp_path: Path) -> None:
     assert rows[0]["disturbance price (1)"] == ""
     found = [float(row["disturbance price (1)"]) for row in rows[1:]]
     np.testing.assert_allclose(found, env.physical.disturbances[:-1, 0, 0])
+    shown = CliRunner().invoke(app, ["show", str(path), "--picture", str(tmp_path / "line.png")])
+    assert shown.exit_code == 0 and re.search(r"outage +│ markov +│ +0.4 … 1 +│ now +│ arcs.leak.rate", shown.output)
     shown = CliRunner().invoke(app, ["simulate", str(path), "--samples", "5", "--out", str(tmp_path)])
     assert shown.exit_code == 0, shown.output
     with (tmp_path / "line_neutral_bands.csv").open(newline="") as file:
@@ -559,6 +564,7 @@ def test_the_command_shows_what_happened(tmp_path: Path) -> None:
     np.testing.assert_allclose(found, samples[:, names.index("record")].mean(axis=0))
 
 
+@pytest.mark.medium
 def test_the_worst_episodes_are_told(tmp_path: Path) -> None:
     """CVaR with a fraction of an episode, its interval, and that of every policy in tables and files."""
     rng = np.random.default_rng(0)

@@ -92,7 +92,7 @@ def show(
     from cirl_marl.drawing.folding import fold_copies
     from cirl_marl.environments.vector import MultiAgentVectorEnv
     from cirl_marl.network.series import Series, extremes
-    from cirl_marl.report.terminal import arcs_table, nodes_table
+    from cirl_marl.report.terminal import arcs_table, disturbances_table, nodes_table
 
     definition = load_network(network, scenario=scenario)
     env = MultiAgentVectorEnv(definition, num_envs=1)
@@ -108,6 +108,8 @@ def show(
         variation = ", changing in time" if isinstance(service.low, Series) or isinstance(service.high, Series) else ""
         subject = f"{service.measure or service.quantity} of {' and '.join(service.providers)}"
         console.print(f"service '{service.id}': {subject} {' and '.join(ends)}{variation}")
+    if definition.disturbed:
+        console.print(disturbances_table(definition))
     circularity = float(definition.circularity(flow))
     console.print(f"λ of the start state: {circularity:.5g} {definition.mass_unit}")
     say(f"start: {start.description}")

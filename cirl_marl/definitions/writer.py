@@ -25,7 +25,6 @@ from cirl_marl.network.declarations import (
     default_of,
     is_required,
 )
-from cirl_marl.network.disturbances import KINDS, Disturbance
 from cirl_marl.network.elements import Arc, Compartment, Control, ControlKind, Law
 from cirl_marl.network.series import Series, Value
 from cirl_marl.network.uncertainty import Spread
@@ -108,7 +107,7 @@ class _Writer:
         tables: dict[str, Any] = {}
         if network.disturbances:
             tables["disturbances"] = {
-                name: {"kind": _kind(part), **self._part(part), "unit": part.unit, "source": SOURCE}
+                name: {"kind": part.kind, **self._part(part), "unit": part.unit, "source": SOURCE}
                 for name, part in network.disturbances.items()
             }
         if network.correlation is not None:
@@ -218,10 +217,6 @@ def _spread_keys(spread: Spread | None, value: Value) -> dict[str, Any]:
     if math.isfinite(spread.high):
         entries["range"] = [spread.low * middle, spread.high * middle]
     return entries
-
-
-def _kind(disturbance: Disturbance) -> str:
-    return next(kind for kind, record in KINDS.items() if type(disturbance) is record)
 
 
 def _law_field(part: Any) -> str:

@@ -58,6 +58,11 @@ class Disturbance(CheckedRecord):
     ] = False
 
     @property
+    def kind(self) -> str:
+        """What definition files call its kind."""
+        return next(kind for kind, record in KINDS.items() if type(self) is record)
+
+    @property
     def ends(self) -> tuple[float, float]:
         """Lowest and highest value."""
         raise NotImplementedError
@@ -397,7 +402,7 @@ class Correlation(CheckedRecord):
             if name not in disturbances:
                 yield unknown_name("disturbance", name, disturbances)
             elif not isinstance(disturbances[name], Gaussian):
-                kind = next(kind for kind, record in KINDS.items() if isinstance(disturbances[name], record))
+                kind = disturbances[name].kind
                 yield f"'{name}' is of kind '{kind}'; only ar1, random_walk and seasonal can be correlated"
         count, matrix = len(self.names), self.matrix
         if len(set(self.names)) < count:

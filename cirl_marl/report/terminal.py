@@ -134,6 +134,26 @@ def control_text(network: Network, compartment: Compartment) -> str:
     return f"{control.kind.value} {bounds}{unit}"
 
 
+def disturbances_table(network: Network) -> Table:
+    """One row a disturbance that disturbs something: its kind, ends, who sees it, and what it disturbs."""
+    rows = []
+    for name, part in zip(network.processes.names, network.processes.disturbances, strict=True):
+        low, high = part.ends
+        seen = f"{part.delayed} late" if part.delayed else f"{part.forecast} ahead" if part.forecast else part.observed
+        places = [path for path, effect in network.disturbed.items() if effect.by == name]
+        rows.append(
+            [
+                name,
+                part.kind,
+                f"{low:.4g} … {high:.4g} {'' if part.unit == '1' else part.unit}",
+                seen,
+                "\n".join(places),
+            ]
+        )
+    headings = ["disturbance", "kind", "values", "seen", "disturbs"]
+    return text_table("", headings, rows, text=["disturbance", "kind", "seen", "disturbs"])
+
+
 def evaluation_table(figures: Mapping[str, Any]) -> Table:
     """One row a controller: λ̄, gain, service level with confidence intervals; returns as means over the agents."""
     unit, rows = figures["unit"], figures["controllers"]
