@@ -193,6 +193,8 @@ def test_what_is_correlated_is() -> None:
     phi, psi = memory["price"], memory["season"]
     expected = -0.3 * np.sqrt((1 - phi**2) * (1 - psi**2)) / (1 - phi * psi)
     for t in (0, 4):
+        for name in ("price", "season"):  # as at any other time
+            assert states[t, row[name]].var() == pytest.approx(1.0, rel=0.05)
         assert np.corrcoef(states[t, row["price"]], states[t, row["season"]])[0, 1] == pytest.approx(expected, abs=0.03)
 
 
