@@ -55,6 +55,7 @@ from cirl_marl.network.disturbances import (
     RandomWalk,
     Seasonal,
 )
+from cirl_marl.network.elements import Lifetime
 from cirl_marl.network.processes import Paths
 from cirl_marl.network.uncertainty import Spread, draw_network, expected_network
 from cirl_marl.optimum.mpc import MPC, Optimum
@@ -614,3 +615,28 @@ def test_a_world_is_resumed_with_its_disturbances() -> None:
     for name in ("processes", "disturbances"):
         del old["state"][name]
     NetworkWorld(MultiAgentVectorEnv(certain.network, num_envs=2), [5, 6], {}).load_state_dict(old)
+
+
+def test_lifetimes_are_disturbed_unless_they_are_fixed() -> None:
+    """A stretch of all that is in use; what leaves follows from it, as in the network of the path."""
+    network, disturbed = line({}), {"nodes.store.stretch": DisturbanceEffect(by="record")}
+    leak = Arc(id="leak", donor="store", recipient="dump", law=Law.SHARE, share=1.0)
+    arcs = tuple(leak if arc.id == "leak" else arc for arc in network.arcs)
+
+    def living(lifetime: Lifetime) -> Network:
+        nodes = tuple(replace(n, lifetime=lifetime) if n.id == "store" else n for n in network.nodes)
+        return replace(network, nodes=nodes, arcs=arcs, disturbed=disturbed)
+
+    spread = living(Lifetime(mean=5.0, deviation=2.5, distribution="gamma"))
+    env = MultiAgentVectorEnv(spread, num_envs=2)
+    run = rollout(env, Neutral(), seed=4)
+    for i in (0, 1):
+        same = MultiAgentVectorEnv(env.certain_network(i), num_envs=2)
+        np.testing.assert_allclose(
+            rollout(same, Neutral(), seed=4).circularity_mean[i], run.circularity_mean[i], rtol=1e-9
+        )
+    assert np.ptp(run.episode_circularity) > 1e-3
+    with pytest.raises(
+        NetworkError, match=r"nodes.store.stretch: only a lifetime with a deviation can be .* disturbed"
+    ):
+        living(Lifetime(mean=2.0, distribution="fixed"))
