@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from small_networks import constant
 
+from cirl_marl import bound, load_network, plan
 from cirl_marl.controllers import Constant, Neutral, Random
 from cirl_marl.controllers.rollout import first_seed, rollout
 from cirl_marl.controllers.schedule import schedule
@@ -29,6 +31,23 @@ def test_neutral_plan_holds_the_neutral_controls() -> None:
         column = {"rate": "valve factor (1)", "flow": "flow ordered (kt/day)"}[control.kind.value]
         np.testing.assert_allclose(table[f"{agent}: {column}"], constant(control.neutral))
     np.testing.assert_array_equal(table["mean circularity (kt)"], found.rollout.circularity_mean[0])
+    stocks = np.array([table[f"stock of {node.id} at the end (kt)"] for node in env.network.stores])
+    np.testing.assert_array_equal(stocks.T, found.rollout.stock)
+
+
+@pytest.mark.parametrize("demand", [None, 0.9])
+def test_a_plan_says_what_bounds_it(demand: float | None) -> None:
+    """The λ̄ that it names is a bound for the service of the plan, above the plan by the gap that it names."""
+    network = load_network("copper_net").with_options(episode={"horizon": 6})
+    found = plan(network, "optimum", min_service=demand)
+    achieved, service = float(found.rollout.episode_circularity[0]), float(found.rollout.episode_service[0])
+    match = re.search(r"λ̄ ≤ (\S+) kt, gap (\S+)%$", found.proof)
+    assert match is not None and found.proof in str(found).splitlines()
+    limit, share = float(match[1]), float(match[2]) / 100
+    assert share == pytest.approx((limit - achieved) / abs(limit), abs=2e-4) and 0 <= share < 0.2
+    least = service - 1e-6 if demand is None else demand
+    assert bound(network, found.episode_start.initial_state, min_service=least).objective <= limit + 2e-3 * abs(limit)
+    assert plan(network, "neutral").proof == ""
 
 
 def test_orders_have_the_unit_of_a_flow() -> None:

@@ -192,9 +192,9 @@ def plan(
 
     The CSV has a row for each control interval: when it begins and ends (if the network has a start on the calendar
     with the year or date on which it begins), the value of every control (a flow ordered, a share, a factor on a
-    lifetime or on what a valve lets through, or an input of a model) with its unit, flows, circularity and service
-    level. The workbook beside it (.xlsx) has the decisions in words, with stocks and flows, as planned and as usual;
-    the picture (.png) the levers that differ most.
+    lifetime or on what a valve lets through, or an input of a model) with its unit, flows, circularity, service level
+    and stocks. The workbook beside it (.xlsx) has the decisions in words, with stocks and flows, as planned and as
+    usual; the picture (.png) the levers that differ most.
     """
     from cirl_marl.evaluation import plans
     from cirl_marl.report.decisions import NO_WORKBOOK, decisions_table, savings_table, write_decisions

@@ -24,7 +24,8 @@ class Schedule:
     """One episode: the network, a header with units, columns of shape (columns, steps), its start, and the rollout.
 
     ``usual`` is what becomes of the same start if nobody acts, ``agents`` are those who do. ``control`` names who acts,
-    empty for learnt policies; ``note`` is what has to be said beside the figures.
+    empty for learnt policies; ``note`` is what has to be said beside the figures,
+    ``proof`` what no episode from this start can exceed, and how far this one stays below it.
     """
 
     network: Network
@@ -36,13 +37,14 @@ class Schedule:
     agents: tuple[str, ...]
     control: str = ""
     note: str = ""
+    proof: str = ""
 
     def __str__(self) -> str:
         """Say where the episode begins, what comes of it, and what business as usual would have come to."""
         usual = f"λ̄ = {float(self.usual.episode_circularity[0]):.5g} {self.network.mass_unit}"
         usual += f", service level {float(self.usual.episode_service[0]):.4f}"
         lines = [*outcome_lines(self.network, self.rollout, self.episode_start), f"as usual: {usual}"]
-        return "\n".join([*lines, self.note] if self.note else lines)
+        return "\n".join([*lines, *filter(None, (self.proof, self.note))])
 
     def write(self, path: Path) -> None:
         """Write a CSV file, whole or not at all; a ``CirlError`` says so if its folder is not there.
@@ -68,7 +70,7 @@ def schedule(
     """Run one episode and tabulate it, a row for each control interval.
 
     Columns are when the interval begins and ends, the value of every control in it, the mass that an agent with a valve
-    lets through, λ at its end and its mean over it, and the service level.
+    lets through, λ at its end and its mean over it, the service level, and stocks at its end.
 
     It begins at ``episode_start(env, seed)``. ``progress`` is called with the share that is done.
 
@@ -91,6 +93,10 @@ def schedule(
         (f"circularity at the end ({network.mass_unit})", run.circularity[0]),
         (f"mean circularity ({network.mass_unit})", run.circularity_mean[0]),
         ("service level (1)", run.service[0]),
+        *(
+            (f"stock of {node.id} at the end ({network.mass_unit})", run.stock[:, i])
+            for i, node in enumerate(network.stores)
+        ),
     ]
     header, table = zip(*columns, strict=True)
     return Schedule(network, header, np.array(table), origin, run, usual, env.agents)

@@ -15,6 +15,9 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Network
+from cirl_marl.optimum.bounds import Bound, gap
+from cirl_marl.optimum.mpc import Optimum
+from cirl_marl.optimum.options import levels_text
 from cirl_marl.optimum.registry import CONTROLLERS, named_controller
 
 
@@ -54,7 +57,24 @@ def plan(
     env, controller = _environment_and_controller(source, control, scenario, min_service)
     table = schedule(env, controller, seed=seed, progress=progress)
     name = type(control).__name__ if isinstance(control, Controller) else control or ""
-    return replace(table, control=name, note=controller.note)
+    return replace(table, control=name, note=controller.note, proof=_proof(controller, table))
+
+
+def _proof(controller: Controller, table: Schedule) -> str:
+    """Say what λ̄ no episode with this service exceeds, and how far the plan stays below; empty where nothing does.
+
+    Of λ̄/scale + w·service ≤ β follows λ̄ ≤ scale·(β − w·service) for all that serve as much.
+    """
+    if not isinstance(controller, Optimum) or not isinstance(solution := controller.plans[0], Bound):
+        return ""
+    network, run, limit, demand = table.network, table.rollout, solution.objective, "any service"
+    if solution.service_weight is not None:
+        limit -= solution.service_weight * float(run.episode_service[0])
+        limit, demand = limit * network.objective.circularity_scale, "this service"
+    elif solution.min_service is not None:
+        demand = f"a service of at least {levels_text(network, solution.min_service)}"
+    share = float(gap(limit, float(run.episode_circularity[0])))
+    return f"bound with {demand}: λ̄ ≤ {limit:.5g} {network.mass_unit}, gap {share:.2%}"
 
 
 def _environment_and_controller(

@@ -31,7 +31,7 @@ def episodes_of_plan(
 ) -> list[PlannedEpisode]:
     """Return the episodes of a plan.
 
-    A table with stocks and flows, as ``cirl simulate`` writes it, is taken as it is. One with controls alone, as
+    A table with stocks and flows, as ``cirl simulate`` writes it, is taken as it is. One with controls, as
     ``cirl plan`` writes it, is carried out again from ``episode_start``. The policies of a run play fresh episodes.
 
     Args:
@@ -48,7 +48,7 @@ def episodes_of_plan(
     if path.is_dir():
         return _episodes_of_run(RunDirectory(path), first_seed(0 if seed is None else seed), episodes)
     table = _Table(path)
-    if any(name.startswith("stock of ") for name in table.header):
+    if any(name.startswith("flow of ") for name in table.header):
         return [_simulated_episode(network, table)]
     return [_carry_out(network, table, seed)]
 

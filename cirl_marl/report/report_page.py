@@ -141,7 +141,7 @@ def page_of_schedule(schedule: Schedule) -> ReportPage:
         _episode(title, network, schedule.agents, outcome)
         for title, outcome in ((USUAL, schedule.usual), (name, schedule.rollout))
     )
-    notes = (f"Start: {schedule.episode_start.description}.", *([note] if note else []))
+    notes = (f"Start: {schedule.episode_start.description}.", *filter(None, (schedule.proof, note)))
     return ReportPage(_title(network), network, episodes, notes=notes)
 
 
