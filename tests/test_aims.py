@@ -104,6 +104,19 @@ def test_several_plans_narrow_the_cone() -> None:
     assert (widths[1] <= widths[0] + 1e-6).all()
 
 
+def test_what_is_found_in_no_time_holds() -> None:
+    """Ranges of a search that is cut short enclose those of one that is not, and it says that it was."""
+    network = ladder(growth=1.2, steps=8)
+    made = course(bound(network, service_weight=2.0))
+    whole, part = infer(network, made), infer(network, made, seconds=0.0)
+    assert whole.finished and not part.finished and part.programs < whole.programs
+    assert (part.low <= whole.low + 1e-6).all() and (part.high >= whole.high - 1e-6).all()
+    assert any("Time ran out" in sentence for sentence in weights_sentences(part))
+    assert not any("Time ran out" in sentence for sentence in weights_sentences(whole))
+    wide = infer(network, made, within=0.9)
+    assert not wide.identifiable and any("No weight is identified: many" in said for said in weights_sentences(wide))
+
+
 @pytest.mark.parametrize("network", ["carbo_net"])
 def test_a_demanded_level_is_worth_its_shadow_price(network: str) -> None:
     """A plan that was made for a level, not for weights, is best for the prices of the levels."""

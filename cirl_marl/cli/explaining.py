@@ -99,6 +99,9 @@ def infer(
     seed: Annotated[
         int | None, typer.Option(min=0, help="With which cirl plan started; of a run, of its episodes.")
     ] = None,
+    seconds: Annotated[
+        float, typer.Option(min=0.0, help="Processor time for programs; one under way is finished first.")
+    ] = 60.0,
     scenario: Scenario = None,
     out: Annotated[Path | None, typer.Option(help="CSV file to write.")] = None,
 ) -> None:
@@ -126,6 +129,7 @@ def infer(
             scenario=scenario,
             seed=seed,
             episodes=episodes,
+            seconds=seconds,
             progress=progress,
         )
     console.print(weights_table(weights))

@@ -13,6 +13,7 @@ References: Ahuja and Orlin 2001, Inverse optimization, Operations Research 49, 
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -42,6 +43,8 @@ CLOSE = 1e-6
 NARROW = 0.1
 """Width of a weight's range, relative to its middle, up to which it counts as found."""
 TINY = 1e-9
+SECONDS = 60.0
+"""Processor time in which programs are begun."""
 
 
 @frozen_record
@@ -57,7 +60,8 @@ class ObjectiveWeights:
     terms: Annotated[tuple[ObjectiveTerm, ...], "what may be aimed at"]
     spread: Annotated[
         Floats,
-        "S_j, shape (terms,); 0 for a term that nothing changes, of which no plan can tell the weight",
+        "S_j, shape (terms,); 0 for a term that nothing changes, of which no plan can tell the weight, or that nothing"
+        " has changed until time ran out",
     ]
     low: Annotated[Floats, "least share of each that fits, shape (terms,)"]
     high: Annotated[Floats, "greatest share"]
@@ -70,6 +74,9 @@ class ObjectiveWeights:
     within: Annotated[float, "distance up to which weights fit"]
     cuts: Annotated[Floats, "the inequalities that were found, Σ u_j cut_j ≤ distance, shape (cuts, terms)"]
     programs: Annotated[int, "how many programs were solved"]
+    finished: Annotated[
+        bool, "False if time ran out: ranges are those of the programs so far, and the distance may be less"
+    ]
 
     def fits(self, weights: ArrayLike) -> bool:
         """Whether weights w_j ≥ 0 of the terms, in their own units, break none of the inequalities."""
@@ -124,6 +131,7 @@ def infer(
     scenario: str | None = None,
     seed: int | None = None,
     episodes: int = 4,
+    seconds: float = SECONDS,
     progress: Callable[[float], None] = lambda share: None,
 ) -> ObjectiveWeights:
     """Return the weights under which plans are (close to) optimal.
@@ -137,6 +145,8 @@ def infer(
         scenario: of the definition.
         seed: of the start of plans that ``cirl plan`` wrote with one; of the episodes of a run.
         episodes: that are taken of a run.
+        seconds: of processor time; a program that may not end in it is not begun, but for a first one, and one of
+            each plan. What was found by then holds.
         progress: called with the share that is done.
 
     Raises:
@@ -148,6 +158,7 @@ def infer(
         raise CirlError(f"within {within!r} must be at least 0 and less than 1")
     if episodes < 1:
         raise CirlError(f"episodes must be at least 1, got {episodes}")
+    stop = time.process_time() + seconds
     network = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
     sources = [plans] if isinstance(plans, str | Path | PlannedEpisode) else list(plans)
     if not sources:
@@ -169,7 +180,7 @@ def infer(
                 f"{plan.name}: has stocks {plan.stock.shape} and flows {plan.flow.shape}, but an episode of"
                 f" '{network.name}' has {shapes[0]} and {shapes[1]}"
             )
-    cone = _Cone([_PlanProgram(programs, terms, plan) for plan in planned_episodes], len(terms), progress)
+    cone = _Cone([_PlanProgram(programs, terms, plan) for plan in planned_episodes], len(terms), stop, progress)
     best, distance = cone.closest()
     low, high, corners = cone.ends(distance + within)
     progress(1.0)
@@ -186,20 +197,25 @@ def infer(
         within=distance + within,
         cuts=cone.cuts,
         programs=cone.programs,
+        finished=cone.finished,
     )
 
 
 class _Cone:
     """The inequalities that are known, and those that are yet to be found."""
 
-    def __init__(self, plans: Sequence[_PlanProgram], count: int, progress: Callable[[float], None]) -> None:
-        self._plans, self._count, self._progress = plans, count, progress
+    def __init__(
+        self, plans: Sequence[_PlanProgram], count: int, stop: float, progress: Callable[[float], None]
+    ) -> None:
+        self._plans, self._count, self._stop, self._progress = plans, count, stop, progress
+        self.finished, self._longest = True, 0.0
         self.programs = 0
         extremes: list[tuple[int, Floats]] = []
         for p, plan in enumerate(plans):
             for unit in np.eye(count):
-                extremes.append((p, plan.maximise(unit)[0]))
-                self.programs += 1
+                if extremes and self._late(reserve=len(plans)):
+                    break
+                extremes.append((p, self._maximise(plan, unit)[0]))
                 progress(0.3 * self.programs / (len(plans) * count))
         points = np.array([*(point for _, point in extremes), *(plan.value for plan in plans)])
         spread = points.max(axis=0) - points.min(axis=0)
@@ -207,7 +223,8 @@ class _Cone:
         self.spread = np.where(spread > 1e-7 * size + TINY, spread, 0.0)
         self._moves = self.spread > 0
         if not self._moves.any():
-            raise CirlError("infer: nothing that can be done changes any of the terms")
+            reason = "nothing that can be done changes any of the terms"
+            raise CirlError(f"infer: {reason if self.finished else 'time ran out before anything was found'}")
         self._rows = [self._row(p, point) for p, point in extremes]
 
     @property
@@ -228,8 +245,7 @@ class _Cone:
         weights = self._per_spread(shares)
         worst = 0.0  # a plan that is outside of what the rows allow may be better than all of it
         for p, plan in enumerate(self._plans):
-            point, bound = plan.maximise(weights)
-            self.programs += 1
+            point, bound = self._maximise(plan, weights)
             self._rows.append(self._row(p, point))
             worst = max(worst, bound - float(weights @ plan.value))
         return worst
@@ -242,7 +258,7 @@ class _Cone:
             distance = self._worst(shares)
             if distance < least:
                 best, least = shares, distance
-            if least <= outside + CLOSE:
+            if least <= outside + CLOSE or self._late():
                 break
         self._progress(0.4)
         return best, least
@@ -256,12 +272,27 @@ class _Cone:
                 cost = np.append(sign * np.eye(self._count)[j], 0.0)
                 for _ in range(ROUNDS):
                     shares, _ = self._minimise(cost, distance)
-                    if self._worst(shares) <= distance + CLOSE:
+                    if self._late() or self._worst(shares) <= distance + CLOSE:
                         break
                 ends[j] = shares[j]
                 corners.append(shares)
             self._progress(0.4 + 0.6 * (place + 1) / len(movable))
         return low, high, corners
+
+    def _late(self, reserve: int = 0) -> bool:
+        """Whether time may run out before one program more, and some in reserve, are solved.
+
+        The inequalities that are known hold nevertheless, so that ranges are only too wide.
+        """
+        late = time.process_time() + (1 + reserve) * self._longest > self._stop
+        self.finished &= not late
+        return late
+
+    def _maximise(self, plan: _PlanProgram, weights: Floats) -> tuple[Floats, float]:
+        begin = time.process_time()
+        best = plan.maximise(weights)
+        self.programs, self._longest = self.programs + 1, max(self._longest, time.process_time() - begin)
+        return best
 
     def _minimise(self, cost: Floats, most: float | None) -> tuple[Floats, float]:
         """Return shares, and the distance, that minimise a cost under the inequalities that are known."""

@@ -25,6 +25,8 @@ def weights_sentences(weights: ObjectiveWeights) -> list[str]:
         f"{plans} {falls} short of the best by {distance} % of what there is to be had, under the weights that suit"
         f" {object_} best."
     ]
+    if not weights.finished:
+        sentences.append(f"Time ran out after {weights.programs} programs: more time may narrow what follows.")
     names, per_unit = [term.name for term in weights.terms], weights.weights(weights.centre)
     spans = [(f"{100 * low:.3g}", f"{100 * high:.3g} %") for low, high in zip(weights.low, weights.high, strict=True)]
     idle = [j for j in range(len(names)) if weights.spread[j] == 0]
@@ -38,9 +40,24 @@ def weights_sentences(weights: ObjectiveWeights) -> list[str]:
     for j, name in enumerate(names):
         if j not in weights.identifiable and j not in idle:
             sentences.append(f"The weight of {name} cannot be told closely: all from {' to '.join(spans[j])} fit.")
+    if not weights.identifiable:
+        sentences.append(
+            "No weight is identified: "
+            + (
+                "the search was not finished; give it more time, or fewer --terms."
+                if not weights.finished
+                else f"many weights leave these plans within {100 * weights.within:.3g} % of the best. Give plans of"
+                " other starts or networks, fewer --terms, or a smaller --within."
+            )
+        )
     if idle:
         idle_names = joined_text([names[j] for j in idle])
-        sentences.append(f"Of {idle_names} there is no telling: nothing that can be done changes it.")
+        reason = (
+            "nothing that can be done changes it"
+            if weights.finished
+            else "time ran out before anything changed it, so it is left out"
+        )
+        sentences.append(f"Of {idle_names} there is no telling: {reason}.")
     return sentences
 
 
