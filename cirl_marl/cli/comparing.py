@@ -83,7 +83,7 @@ def _enough(certain: int, network: str | None, scenario: str | None, runs: Seque
     from cirl_marl.evaluation.comparison import enough_episodes
     from cirl_marl.learners.run_directory import RunDirectory
 
-    if network is None and not runs:
+    if network is None and (scenario is not None or not runs):
         return certain  # nothing can be compared, which is told elsewhere
     definition = RunDirectory(runs[0]).network() if network is None else load_network(network, scenario=scenario)
     return enough_episodes(definition, certain=certain)
