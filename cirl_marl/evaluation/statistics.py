@@ -74,7 +74,7 @@ def worst_mean(samples: ArrayLike, *, resamples: int = TAIL_RESAMPLES, seed: int
     References: Rockafellar and Uryasev 2002, Conditional value-at-risk for general loss distributions.
 
     >>> round(worst_mean(np.arange(50.0)).value, 12)
-    0.6
+    0.8
     """
     figures = np.sort(np.asarray(samples, dtype=float))
     count = len(figures)

@@ -8,11 +8,13 @@ environment is saved, and with it the logs: the checkpoint is a consistent cut, 
 
 A resumed learner is loaded with its state at its first barrier. The environment is already where the logs end, so the
 learner is fed the logged answers until it gets there. It draws from random streams of its own and therefore acts as it
-did, to the bit; an action that differs from the logged one is an error.
+did: to the bit on the same kind of processor, within rounding on another, which a warning says. An action that differs
+by more from the logged one is an error.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -32,6 +34,9 @@ from cirl_marl.network.declarations import with_field_docs
 
 LoggedStep = tuple[NDArray[np.float32], StepResult]
 """An action, and what the environment answered."""
+
+ROUNDING = 1e-3
+"""How far an action in [−1, 1] may be from the logged one: other kernels round otherwise, and updates enlarge it."""
 
 
 @with_field_docs
@@ -73,10 +78,17 @@ class CheckpointBarrier:
             self.log.append((self.agent_env.action.copy(), self.agent_env.last_step))
 
     def replay_step(self, place: int) -> None:
-        """Answer from the replay log; a ``RunError`` if the learner's action is not the logged one."""
-        action, step = self.replay_log[place]
-        if self.agent_env.action is None or not np.array_equal(action, self.agent_env.action):
+        """Answer from the replay log.
+
+        Raises:
+            RunError: if the learner's action is not the logged one.
+        """
+        (logged, step), action = self.replay_log[place], self.agent_env.action
+        if action is None or action.shape != logged.shape or not np.allclose(action, logged, rtol=0.0, atol=ROUNDING):
             raise RunError(f"{self.agent_env.title} does not do again what it did: versions or files are others now")
+        if not np.array_equal(action, logged):
+            message = f"{self.agent_env.title} goes on, but not to the same bits: this processor rounds otherwise"
+            warnings.warn(message, stacklevel=2)
         self.agent_env.last_step = step
 
     def release(self) -> None:
