@@ -8,7 +8,6 @@ import json
 import os
 import shutil
 import warnings
-from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -114,7 +113,10 @@ def test_a_half_trained_run_ends_as_it_would_have(name: str, tmp_path: Path) -> 
 
 def test_actions_of_a_replay_are_those_of_the_log() -> None:
     """To the bit, or within the rounding of another processor, which is said; what differs by more is refused."""
-    logged, step = np.array([[0.25], [-0.5]], dtype=np.float32), StepResult(*[None] * len(fields(StepResult)))
+    logged, step = (
+        np.array([[0.25], [-0.5]], dtype=np.float32),
+        StepResult(np.zeros((2, 1)), np.zeros(2, dtype=np.float32), np.zeros(2, dtype=np.bool_)),
+    )
     agent_env = SimpleNamespace(action=logged.copy(), last_step=None, title="agent 'mine'")
     barrier = CheckpointBarrier(agent_env, replay_log=[(logged, step)])  # type: ignore[arg-type]
     with warnings.catch_warnings():
