@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     from cirl_marl.evaluation.simulations import simulate as simulate
     from cirl_marl.evaluation.simulations import simulate_alternatives as simulate_alternatives
     from cirl_marl.importing.assembly import import_flows as import_flows
+    from cirl_marl.importing.disturbance_fits import fit_disturbances as fit_disturbances
     from cirl_marl.learners.interface import Trained as Trained
     from cirl_marl.learners.interface import export as export
     from cirl_marl.learners.interface import resume as resume
@@ -124,6 +125,7 @@ _MODULES = {
     "evaluation.plans": "plan",
     "evaluation.simulations": "Simulation simulate simulate_alternatives",
     "importing.assembly": "import_flows",
+    "importing.disturbance_fits": "fit_disturbances",
     "learners.interface": "Trained export resume train",
     "learners.recipe": "Recipe load_recipe",
     "learners.teams.team": "Team independent",

@@ -1,4 +1,4 @@
-"""``cirl import``: from tables of measured flows to a definition file."""
+"""``cirl import | fit``: from tables of measured numbers to definition files."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cirl_marl.cli.common import NETWORKS, app, bar, say
+from cirl_marl.cli.common import NETWORKS, app, bar, errors, say
+from cirl_marl.errors import CirlError
 
 if TYPE_CHECKING:
     from cirl_marl.importing.balances import Reconciliation
@@ -128,3 +129,50 @@ def _ask(name: str, kind: str) -> Role:
         answer = str(typer.prompt(f"{kind} '{name}': {choices}?")).strip().lower()
         if answer in ANSWERS:
             return Role(ANSWERS[answer])
+
+
+@app.command(rich_help_panel=NETWORKS)
+def fit(
+    table: Annotated[Path, typer.Argument(metavar="TABLE", help="CSV file with a row for each time.")],
+    column: Annotated[list[str], typer.Option(help="A column with a series; several are correlated.")],
+    kind: Annotated[str, typer.Option(help="Process: ar1, resampled, seasonal or markov.")] = "ar1",
+    plain: Annotated[
+        bool, typer.Option("--plain", help="Noise of the values themselves, not of their logarithm.")
+    ] = False,
+    trend: Annotated[str, typer.Option(help="Trend that is removed: linear (of the logarithm), or none.")] = "linear",
+    unit: Annotated[str, typer.Option(help="Unit of a disturbance that is added; default: it is a factor.")] = "",
+    interval: Annotated[
+        str, typer.Option(help="Control interval, such as '0.25 day'; default: the time between two rows.")
+    ] = "",
+    seasons: Annotated[int, typer.Option(help="Rows after which the season comes again, for seasonal.")] = 0,
+    rows: Annotated[Patterns, typer.Option("--where", help="Which rows: COLUMN=TEXT.")] = None,
+    times: Annotated[str | None, typer.Option(help="Column of times; default: year.")] = None,
+    scenario: Annotated[str, typer.Option(help="Scenario of the definition that has the disturbances.")] = "",
+    source: Annotated[str, typer.Option(help="Where the numbers come from, with the licence.")] = "",
+) -> None:
+    """Estimate disturbances from measured series, and print the tables of a definition, standard errors in the source.
+
+    For example: cirl fit prices.csv --column copper --interval '0.25 day' >> my.toml
+    """
+    from cirl_marl.importing.disturbance_fits import fit_disturbances
+
+    conditions = dict(condition.partition("=")[::2] for condition in rows or ())
+    if unclear := [condition for condition in rows or () if "=" not in condition]:
+        raise CirlError(f"--where {unclear[0]}: write COLUMN=TEXT, such as country=Japan")
+    fits = fit_disturbances(
+        table,
+        column,
+        kind=kind,
+        logarithm=not plain,
+        trend=trend,
+        unit=unit,
+        interval=interval,
+        seasons=seasons,
+        rows=conditions,
+        times=times,
+        source=source,
+    )
+    for name, (change, error) in fits.trends.items():
+        amount = f"{change:.3g} ± {error:.2g} {unit}" if unit else f"{100 * change:.3g} ± {100 * error:.2g} %"
+        errors.print(f"{name}: {fits.rows}; its trend, which is left out, is {amount} a row", soft_wrap=True)
+    typer.echo(fits.tables(scenario), nl=False)

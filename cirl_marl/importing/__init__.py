@@ -1,5 +1,6 @@
-"""From tables of measured flows to a definition file: reading, balances, reconciliation, writing."""
+"""From tables of measured numbers to definitions: flows and balances, and processes of disturbances."""
 
 from cirl_marl.importing.assembly import ImportReport, import_flows
+from cirl_marl.importing.disturbance_fits import DisturbanceFits, fit_disturbances
 
-__all__ = ["ImportReport", "import_flows"]
+__all__ = ["DisturbanceFits", "ImportReport", "fit_disturbances", "import_flows"]
