@@ -2,17 +2,42 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from hypothesis import assume
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Role, Series, Service, load_network
+from cirl_marl import (
+    Arc,
+    Control,
+    ControlKind,
+    Episode,
+    Law,
+    Network,
+    NetworkError,
+    Node,
+    Role,
+    Series,
+    Service,
+    load_network,
+)
 from cirl_marl.definitions.catalogue import families
 from cirl_marl.dynamics.integrator import Dynamics
+from cirl_marl.network.disturbances import (
+    AutoRegression,
+    BlockBootstrap,
+    Correlation,
+    DisturbanceEffect,
+    Markov,
+    RandomWalk,
+    Seasonal,
+)
 from cirl_marl.network.series import Value
+from cirl_marl.network.uncertainty import CAPACITY, Spread
 
 Floats = NDArray[np.float64]
 
@@ -156,3 +181,47 @@ PLAYED = [
     if load_network(name, scenario=scenario).agents
 ]
 """Their scenarios in which somebody acts."""
+
+
+KINDS: Mapping[str, Any] = {
+    "price": AutoRegression(deviation=0.3, persistence=0.8, logarithm=True, low=0.6, high=1.5, forecast=2),
+    "ore": AutoRegression(deviation=0.2, persistence=-0.5, low=0.8, high=1.1, start=1.05, delayed=2),
+    "walk": RandomWalk(deviation=0.1, drift=0.02, low=0.7, high=1.3),
+    "climb": RandomWalk(deviation=0.1, low=0.7, high=1.3, start=1.2, logarithm=True),
+    "outage": Markov(values=(1.0, 0.4, 0.7), matrix=((0.8, 0.15, 0.05), (0.5, 0.5, 0.0), (0.3, 0.0, 0.7))),
+    "stop": Markov(values=(1.0, 0.5), lengths=(8.0, 2.0), start=2),
+    "season": Seasonal(profile=(1.0, 1.2, 0.9), period=4.0, deviation=0.1, persistence=0.6, observed="none"),
+    "harvest": Seasonal(profile=(0.8, 1.2), period=3.0, deviation=0.2, logarithm=True),
+    "record": BlockBootstrap(values=(1.0, 0.8, 1.2, 1.1, 0.9), block=2.5),
+}
+CORRELATION = Correlation(names=("price", "walk", "season"), matrix=((1, 0.8, -0.3), (0.8, 1, 0.0), (-0.3, 0.0, 1)))
+
+
+@st.composite
+def disturbed_networks(draw: st.DrawFn) -> Network:
+    """Draw networks with numbers of every kind that are disturbed, and some that are uncertain, too."""
+    network = draw(st.from_type(Network))
+    paths = [f"arcs.{arc.id}.{name}" for arc in network.arcs for name in ("rate", "flow", "share")]
+    paths += [f"nodes.{node.id}.{name}" for node in network.nodes for name in ("rate", "stretch")]
+    paths += [f"{kind}.{part.id}.{CAPACITY}" for kind in ("nodes", "arcs") for part in getattr(network, kind)]
+    paths += [f"services.{service.id}.{end}" for service in network.services for end in ("low", "high")]
+    names = {name: kind for name, kind in KINDS.items() if kind.ends[0] > 0}
+    names |= {"more": AutoRegression(mean=0.0, deviation=1e-3, persistence=0.5)}
+    spread = Spread(low=0.8, high=1.1, distribution="uniform")
+    network = replace(network, disturbances=names, correlation=CORRELATION, scenarios={})
+    for path in draw(st.lists(st.sampled_from(paths), unique=True, min_size=1, max_size=8)):
+        by, adds = draw(st.sampled_from([*KINDS])), draw(st.booleans())
+        disturbed = DisturbanceEffect(by="more" if adds else by, adds=adds)
+        uncertain = {path: spread} if draw(st.booleans()) else {}
+        try:
+            network = replace(
+                network,
+                disturbed={**network.disturbed, path: disturbed},
+                uncertain={**network.uncertain, **uncertain},
+            )
+        except NetworkError:
+            pass  # this number is not stated, or may become 0
+    assume(network.disturbed)
+    step = network.episode.solver_step  # the fastest draws need a shorter one
+    interval = network.episode.control_interval
+    return network.with_options(episode={} if step is None else {"solver_step": interval / round(3 * interval / step)})

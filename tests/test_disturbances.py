@@ -12,17 +12,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import integrate, stats
+from small_networks import CORRELATION, KINDS, disturbed_networks
 from typer.testing import CliRunner
 
 from cirl_marl import (
     Arc,
     CirlError,
     Constant,
+    Control,
     ControlError,
+    ControlKind,
     DefinitionError,
     Episode,
     Law,
@@ -53,30 +56,16 @@ from cirl_marl.network.disturbances import (
     Gaussian,
     Markov,
     RandomWalk,
-    Seasonal,
 )
 from cirl_marl.network.elements import Lifetime
 from cirl_marl.network.processes import Paths
-from cirl_marl.network.uncertainty import Spread, draw_network, expected_network
+from cirl_marl.network.uncertainty import CAPACITY, Spread, draw_network, expected_network
 from cirl_marl.optimum.mpc import MPC, Optimum
 from cirl_marl.report.page_data import page_data
 from cirl_marl.report.report_page import page_of_samples
-from cirl_marl.report.tradeoffs import summary_of, worst_notes
+from cirl_marl.report.tradeoffs import comparison_notes, summary_of, worst_notes
 
 Floats = NDArray[np.floating]
-
-KINDS: Mapping[str, Any] = {
-    "price": AutoRegression(deviation=0.3, persistence=0.8, logarithm=True, low=0.6, high=1.5, forecast=2),
-    "ore": AutoRegression(deviation=0.2, persistence=-0.5, low=0.8, high=1.1, start=1.05, delayed=2),
-    "walk": RandomWalk(deviation=0.1, drift=0.02, low=0.7, high=1.3),
-    "climb": RandomWalk(deviation=0.1, low=0.7, high=1.3, start=1.2, logarithm=True),
-    "outage": Markov(values=(1.0, 0.4, 0.7), matrix=((0.8, 0.15, 0.05), (0.5, 0.5, 0.0), (0.3, 0.0, 0.7))),
-    "stop": Markov(values=(1.0, 0.5), lengths=(8.0, 2.0), start=2),
-    "season": Seasonal(profile=(1.0, 1.2, 0.9), period=4.0, deviation=0.1, persistence=0.6, observed="none"),
-    "harvest": Seasonal(profile=(0.8, 1.2), period=3.0, deviation=0.2, logarithm=True),
-    "record": BlockBootstrap(values=(1.0, 0.8, 1.2, 1.1, 0.9), block=2.5),
-}
-CORRELATION = Correlation(names=("price", "walk", "season"), matrix=((1, 0.8, -0.3), (0.8, 1, 0.0), (-0.3, 0.0, 1)))
 
 
 def line(disturbed: Mapping[str, DisturbanceEffect], names: Mapping[str, Disturbance] = KINDS, **more: Any) -> Network:
@@ -217,35 +206,6 @@ def test_streams_are_apart() -> None:
     np.testing.assert_array_equal(shorter.physical.disturbances, paths.values[:5])
 
 
-@st.composite
-def disturbed_networks(draw: st.DrawFn) -> Network:
-    """Draw networks with numbers of every kind that are disturbed, and some that are uncertain, too."""
-    network = draw(st.from_type(Network))
-    paths = [f"arcs.{arc.id}.{name}" for arc in network.arcs for name in ("rate", "flow", "share")]
-    paths += [f"nodes.{node.id}.{name}" for node in network.nodes for name in ("rate", "stretch")]
-    paths += [f"services.{service.id}.{end}" for service in network.services for end in ("low", "high")]
-    names = {name: kind for name, kind in KINDS.items() if kind.ends[0] > 0}
-    names |= {"more": AutoRegression(mean=0.0, deviation=1e-3, persistence=0.5)}
-    spread = Spread(low=0.8, high=1.1, distribution="uniform")
-    network = replace(network, disturbances=names, correlation=CORRELATION, scenarios={})
-    for path in draw(st.lists(st.sampled_from(paths), unique=True, min_size=1, max_size=8)):
-        by, adds = draw(st.sampled_from([*KINDS])), draw(st.booleans())
-        disturbed = DisturbanceEffect(by="more" if adds else by, adds=adds)
-        uncertain = {path: spread} if draw(st.booleans()) else {}
-        try:
-            network = replace(
-                network,
-                disturbed={**network.disturbed, path: disturbed},
-                uncertain={**network.uncertain, **uncertain},
-            )
-        except NetworkError:
-            pass  # this number is not stated, or may become 0
-    assume(network.disturbed)
-    step = network.episode.solver_step  # the fastest draws need a shorter one
-    interval = network.episode.control_interval
-    return network.with_options(episode={} if step is None else {"solver_step": interval / round(3 * interval / step)})
-
-
 @pytest.mark.medium
 @given(disturbed_networks(), st.integers(0, 99))
 def test_a_disturbed_network_is_the_network_of_its_path(network: Network, seed: int) -> None:
@@ -375,6 +335,97 @@ def test_plans_are_for_what_is_expected() -> None:
     for controller in (Optimum(min_service=0.5), MPC(replan=6, min_service=0.5)):
         assert rollout(env, controller).episode_circularity.shape == (2,)
     assert not expected.disturbed and expected_network(copper) is copper
+
+
+def works(neutral: float = 6.0, **more: Any) -> Network:
+    """Return a mine whose output is ordered within a capacity, and a furnace with a valve."""
+    order = Control(kind=ControlKind.FLOW, low=1.0, neutral=neutral, high=8.0)
+    valve = Control(kind=ControlKind.RATE, low=0.0, neutral=1.0, high=1.0)
+    return Network(
+        name="works",
+        nodes=(
+            Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR),
+            Node(id="furnace", initial=(30.0, 30.0), control=valve),
+            Node(id="dump", role=Role.LANDFILL, initial=(0.0, 0.0)),
+        ),
+        arcs=(
+            Arc(id="dig", donor="mine", recipient="furnace", law=Law.CONTROLLED, control=order, **more),
+            Arc(id="melt", donor="furnace", recipient="dump", rate=0.2),
+        ),
+        services=(Service(id="molten", provider="furnace", quantity="stock", low=40.0),),
+        episode=Episode(horizon=8),
+    )
+
+
+def test_capacities_are_disturbed() -> None:
+    """The whole range of actions is what there is; who is neutral, or makes up for something, takes no more."""
+    names = {"outage": KINDS["outage"], "boom": RandomWalk(deviation=0.3, low=0.5, high=1.5)}
+    effects = {f"arcs.dig.{CAPACITY}": "boom", f"nodes.furnace.{CAPACITY}": "outage"}
+    disturbed = {path: DisturbanceEffect(by=by) for path, by in effects.items()}
+    network = replace(works(), disturbances=names, disturbed=disturbed)
+    env = MultiAgentVectorEnv(network, num_envs=3, reward="difference")
+    assert network.initial[0, network.node_index["mine"]] == pytest.approx(8 * 8.0 * 1.5, rel=1e-6)
+    env.reset(seed=1)
+    for t in range(8):
+        outage, boom = env.physical.disturbances[t]
+        most = 8.0 * boom
+        neutral = np.minimum(6.0, most)
+        np.testing.assert_allclose(env.neutral_action["dig"][:, 0], 2 * (neutral - 1) / (most - 1) - 1)
+        asked = env.unstack(np.random.default_rng(t).uniform(-1, 1, (2, 3)))
+        action = asked["dig"][:, 0]
+        before, factors = env.physical, env.factors_in(env.physical.step)
+        outcome = env.advance(env.stack(asked))
+        np.testing.assert_allclose(outcome.flow[0], 1 + (action + 1) / 2 * (most - 1), rtol=1e-12)
+        np.testing.assert_allclose(env.controls[0], (asked["furnace"][:, 0] + 1) / 2 * outage, atol=1e-12)
+        # what would have been, had the mine been neutral
+        controls = env.controls.copy()
+        controls[1] = neutral
+        other = env.dynamics.advance(before.stock, before.inner, controls, before.step, factors)
+        expected = outcome.circularity - network.circularity(other.flow)
+        np.testing.assert_allclose(outcome.reward[env.agents.index("dig")], expected, atol=1e-9)
+    makes_up = replace(works(makes_up_for="molten"), disturbances=names, disturbed=disturbed)
+    run = rollout(MultiAgentVectorEnv(makes_up, num_envs=2), Neutral(), seed=5)
+    path = makes_up.processes.sample([5]).values[:-1, :, 0]
+    np.testing.assert_allclose(run.controls[:3, 1], 8.0 * path[:3, 1], rtol=1e-9)  # all of it, as much lacks
+    certain = rollout(MultiAgentVectorEnv(draw_network(makes_up, (), path), num_envs=1), Neutral(), seed=5)
+    np.testing.assert_allclose(certain.circularity_mean[0], run.circularity_mean[0], rtol=1e-12)
+
+
+def test_capacities_in_files(tmp_path: Path) -> None:
+    """A control says what disturbs it; bounds that would cross, and bounds that are no capacity, are refused."""
+    effect = {f"arcs.dig.{CAPACITY}": DisturbanceEffect(by="outage")}
+    network = replace(works(), disturbances={"outage": KINDS["outage"]}, disturbed=effect)
+    path = tmp_path / "works.toml"
+    write_network(network, path)
+    assert load_network(path).disturbed == effect
+    text = path.read_text()
+    assert text.count('disturbed_by = "outage"') == 1
+    for old, new, message in (
+        ("high = 8.0", "high = 6.0", None),
+        ("values = [1.0, 0.4, 0.7]", "values = [1.0, 0.1, 0.7]", "'outage' it may be 0.8, below control.low 1; lower"),
+        ('disturbed_by = "outage"', 'disturbed_by = "outrage"', "disturbed_by: .*Did you mean 'outage'"),
+    ):
+        path.write_text(text.replace(old, new))
+        if message is None:
+            load_network(path)
+        else:
+            with pytest.raises(DefinitionError, match=message):
+                load_network(path)
+    scenario = '[scenarios.hazards.nodes.furnace.control]\ndisturbed_by = "outage"\n'
+    path.write_text(f"{text}\n{scenario}")
+    assert f"nodes.furnace.{CAPACITY}" in load_network(path, scenario="hazards").disturbed
+    shares = replace(line({}), disturbances=KINDS)
+    tails = replace(shares.arcs[1], share=None, control=Control(kind=ControlKind.SHARE, low=0.0, neutral=0.1, high=0.2))
+    shares = replace(shares, arcs=(shares.arcs[0], tails, *shares.arcs[2:]))
+    for part, message in (
+        ("arcs.tails", "a control of kind 'share' has no capacity: shares are parts of a whole"),
+        ("arcs.leak", "arcs.leak.control.high: it has no control"),
+        ("services.metal_kept", "of services these can be uncertain: low, high; 'control.high' cannot"),
+    ):
+        with pytest.raises(NetworkError, match=message):
+            replace(shares, disturbed={f"{part}.{CAPACITY}": DisturbanceEffect(by="outage")})
+    with pytest.raises(NetworkError, match="can be disturbed in time, but not drawn"):
+        replace(works(), uncertain={f"arcs.dig.{CAPACITY}": Spread(low=0.9, high=1.1, distribution="uniform")})
 
 
 def test_both_ends_of_a_band_may_move_together() -> None:
@@ -582,7 +633,7 @@ def test_the_worst_episodes_are_told(tmp_path: Path) -> None:
     assert worst_mean(np.array([3.0, 1.0, 2.0])).value == 1.0
     network = line(EVERYWHERE)
     comparison = compare((), ("neutral",), network=network, bounds=False)
-    assert comparison.episodes == 256
+    assert comparison.episodes == 256 and comparison.undecided == ()
     assert compare((), ("neutral",), network=line({}), bounds=False).episodes == 64
     (row,) = comparison.rows
     kept = comparison.entries[0].rollout
@@ -640,3 +691,26 @@ def test_lifetimes_are_disturbed_unless_they_are_fixed() -> None:
         NetworkError, match=r"nodes.store.stretch: only a lifetime with a deviation can be .* disturbed"
     ):
         living(Lifetime(mean=2.0, distribution="fixed"))
+
+
+@pytest.mark.medium
+def test_episodes_are_added_until_differences_can_be_told() -> None:
+    """As those of one comparison with as many; random orders are on average those of who is neutral."""
+    outage = replace(KINDS["outage"], values=(1.0, 0.05, 0.5))
+    disturbed = {"arcs.melt.rate": DisturbanceEffect(by="outage")}
+    network = replace(works(4.5), disturbances={"outage": outage}, disturbed=disturbed, default_agents=("dig",))
+    clear = compare((), ("neutral", "scripted"), network=replace(network, default_agents=()), bounds=False)
+    assert clear.episodes == 256 and clear.undecided == ()
+    unclear = compare((), ("random",), network=network, bounds=False)
+    assert unclear.episodes > 256
+    whole = compare((), ("random",), network=network, bounds=False, episodes=unclear.episodes)
+    assert whole.undecided is None
+    entry, other = unclear.entries[0], whole.entries[0]
+    assert entry.name == "neutral" and unclear.entries[1].name == "random"
+    for name in ("circularity_mean", "levels", "disturbances", "returns", "flow"):
+        np.testing.assert_array_equal(getattr(entry.rollout, name), getattr(other.rollout, name))
+    np.testing.assert_allclose(entry.rollout.mean_flow, other.rollout.mean_flow, rtol=1e-12)
+    difference = unclear.entries[1].circularity - unclear.entries[0].circularity
+    wide = 1.96 * difference.std() / np.sqrt(unclear.episodes) > max(abs(difference.mean()), 0.005 * 6)
+    assert unclear.episodes == 1024 or not wide
+    assert f"episodes: {unclear.episodes}, doubled from 256 to at most 1,024" in comparison_notes(unclear)[0]

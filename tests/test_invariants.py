@@ -11,7 +11,7 @@ import pytest
 from conftest import random_network
 from hypothesis import example, given
 from hypothesis import strategies as st
-from small_networks import PLAYED
+from small_networks import PLAYED, disturbed_networks
 
 from cirl_marl import Law, MultiAgentVectorEnv, Network, SingleAgentEnv, load_network, parallel_env
 from cirl_marl.network.elements import REWARDS
@@ -22,7 +22,8 @@ EPS = float(np.finfo(float).eps)
 CATALOGUE = [pytest.param(name, scenario, id=f"{name}-{scenario}") for name, scenario in PLAYED]
 Actions = dict[str, np.ndarray[Any, Any]]
 anything = pytest.mark.parametrize(("name", "scenario"), CATALOGUE)
-random_networks = given(network=st.from_type(Network), seed=st.integers(0, 2**31))
+any_network = st.from_type(Network) | disturbed_networks()
+random_networks = given(network=any_network, seed=st.integers(0, 2**31))
 
 
 def draw(env: MultiAgentVectorEnv, rng: np.random.Generator) -> Actions:
@@ -108,7 +109,7 @@ def assert_batch_is_lone(network: Network, seed: int, reward: str) -> None:
 
 
 @pytest.mark.medium
-@given(network=st.from_type(Network), seed=st.integers(0, 2**31), reward=st.sampled_from(REWARDS))
+@given(network=any_network, seed=st.integers(0, 2**31), reward=st.sampled_from(REWARDS))
 def test_random_batch_equals_lone(network: Network, seed: int, reward: str) -> None:
     """Same seed, same bits; a copy of a batch equals a lone environment, and all views agree."""
     assert_batch_is_lone(network, seed, reward)
@@ -150,7 +151,7 @@ def test_random_networks_conform(network: Network, seed: int) -> None:
     check_vector_env(lambda: MultiAgentVectorEnv(network, num_envs=2), steps=6, seed=seed)
 
 
-@given(network=st.from_type(Network), seed=st.integers(0, 2**31), mode=st.sampled_from(["neighbours", "full"]))
+@given(network=any_network, seed=st.integers(0, 2**31), mode=st.sampled_from(["neighbours", "full"]))
 @example(network=random_network(14662095, 8, 0, lifetimes=True), seed=0, mode="neighbours")  # what comes out of slots
 @example(network=random_network(83522, 12, 4, lifetimes=True), seed=0, mode="neighbours")  # a pass of 1 less rounding
 def test_wider_observations_conform(network: Network, seed: int, mode: str) -> None:

@@ -78,7 +78,7 @@ EpisodeSeed = Annotated[
 ]
 EpisodeCount = Annotated[int, typer.Option(min=2, help="Fresh episodes to evaluate on.")]
 EpisodesOfRun = Annotated[
-    int | None, typer.Option(min=2, help="Fresh episodes; default: 64, or 256 of a network that is disturbed.")
+    int | None, typer.Option(min=2, help="Fresh episodes; default: 64, or of a disturbed network 256 to 1024.")
 ]
 Uncertain = Annotated[
     bool | None,

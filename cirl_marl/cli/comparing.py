@@ -41,7 +41,7 @@ def compare(
     ] = None,
     scenario: Scenario = None,
     episodes: Annotated[
-        int | None, typer.Option(min=2, help="Fresh episodes; default: 16, or 256 of a network that is disturbed.")
+        int | None, typer.Option(min=2, help="Fresh episodes; default: 16, or of a disturbed network 256 to 1024.")
     ] = None,
     seed: Seed = 0,
     min_service: MinService = None,
@@ -77,16 +77,15 @@ def compare(
         say(f"wrote {path}")
 
 
-def _enough(certain: int, network: str | None, scenario: str | None, runs: Sequence[Path]) -> int:
-    """Return the default number of episodes of a network, or else of that of the first run."""
+def _enough(certain: int, network: str | None, scenario: str | None, runs: Sequence[Path]) -> int | None:
+    """Return the default number of episodes of a network, or else of that of the first run; None if it is disturbed."""
     from cirl_marl.definitions.catalogue import load_network
-    from cirl_marl.evaluation.comparison import enough_episodes
     from cirl_marl.learners.run_directory import RunDirectory
 
     if network is None and (scenario is not None or not runs):
         return certain  # nothing can be compared, which is told elsewhere
     definition = RunDirectory(runs[0]).network() if network is None else load_network(network, scenario=scenario)
-    return enough_episodes(definition, certain=certain)
+    return None if definition.disturbed else certain
 
 
 @app.command(rich_help_panel=COMPARISONS)

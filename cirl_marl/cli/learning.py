@@ -12,7 +12,6 @@ from cirl_marl.cli.common import (
     LEARNERS,
     OBSERVE,
     REWARDS,
-    EpisodeCount,
     EpisodesOfRun,
     Html,
     RunPath,
@@ -77,7 +76,7 @@ def train(
     checkpoint_every: Annotated[
         float | None, typer.Option(min=0, help="Seconds between checkpoints; 0: none by time.", show_default="60")
     ] = None,
-    episodes: EpisodeCount = 64,
+    episodes: EpisodesOfRun = None,
 ) -> None:
     """Train one learner per compartment, all at once, then evaluate them and draw what changed.
 

@@ -246,6 +246,7 @@ class Converter:
         sides = {
             side: self._in_time(getattr(control, side), unit, f"{path}.{side}") for side in ("low", "neutral", "high")
         }
+        self._disturb(control, control.unit, target or "1", f"{path}.high")
         return Control(kind=control.kind, **sides)
 
     def _number(self, quantity: Any, kind: str, path: str) -> float:

@@ -19,6 +19,7 @@ from cirl_marl.definitions.quantities import (
     Record,
     SeriesTable,
     Source,
+    StatedTable,
     Table,
     Time,
     VaryingAmount,
@@ -157,7 +158,12 @@ def _disturbance_table(kind: str) -> Any:
 
 
 FixedQuantity = number_forms(QuantityTable, None, ColumnTable)
-ControlTable = table_of(Control)
+_CAPACITY = Field(None, description="name of a disturbance of its capacity, the value at action +1")
+ControlTable = table_of(
+    Control,
+    disturbed_by=(str | None, _CAPACITY),
+    disturbed_as=(StatedTable.model_fields["disturbed_as"].annotation, StatedTable.model_fields["disturbed_as"]),
+)
 LifetimeTable = table_of(Lifetime)
 NodeTable = table_of(Node)
 ArcTable = table_of(Arc)

@@ -27,7 +27,7 @@ from cirl_marl.network.declarations import (
 )
 from cirl_marl.network.elements import Arc, Compartment, Control, ControlKind, Law
 from cirl_marl.network.series import Series, Value
-from cirl_marl.network.uncertainty import Spread
+from cirl_marl.network.uncertainty import CAPACITY, Spread
 
 SOURCE = "network built in Python"
 
@@ -153,6 +153,8 @@ class _Writer:
             elif isinstance(declaration, Subtable):
                 write = {"control": self._control, "model": self._model}.get(declaration.of)
                 table[key] = write(part) if write else self._part(value)
+                if isinstance(value, Control):
+                    table[key] |= self._disturbance_keys(f"{path}.{CAPACITY}")
             elif isinstance(value, tuple):
                 table[key] = list(value)
             else:

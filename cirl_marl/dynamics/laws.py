@@ -109,6 +109,8 @@ class ArcRates:
     def _bound_rates(self, draws: FlowFactors | None) -> None:
         """Bound what arcs carry and stocks drive with every control at its upper bound."""
         widest = single_column(self.control_high).max(axis=1, keepdims=True)
+        if draws is not None:
+            widest[draws.capacity.rows] *= draws.highest_capacity
         widest[self._stretch_rows] = self.control_low[self._stretch_rows].min(axis=1, keepdims=True)
         self.max_rate: Floats = self._rate_without_shares(widest)[:, 0]
         if len(self._series_arcs):
@@ -267,10 +269,17 @@ class FlowLaws(ArcRates):
             self._factors.multiply(rate, factors)
         return rate
 
-    def neutral_in(self, step: Integers) -> Floats:
+    def neutral_in(self, step: Integers, factors: Floats | None = None) -> Floats:
         """Return the controls while nobody acts, in one interval of each copy, shape (controls, B)."""
-        table = single_column(self.neutral)  # ``take`` would first write out what is broadcast
-        return table.take(step, axis=1) if table.shape[1] > 1 else np.repeat(table, len(step), axis=1)
+        neutral = _in_interval(self.neutral, step)
+        if factors is None or self._factors is None or not len(self._factors.capacity.rows):
+            return neutral
+        return np.minimum(neutral, self.capacity_in(step, factors))
+
+    def capacity_in(self, step: Integers, factors: Floats | None) -> Floats:
+        """Return the upper bounds of the controls, likewise."""
+        bounds = _in_interval(self.control_high, step)
+        return bounds if self._factors is None else self._factors.capacity(bounds, factors)
 
     def flow(self, stock: Floats, rate: Floats) -> Floats:
         """Return the flows f = r ∘ y[driver], shape (arcs, B), mass/time; ``routing`` fills in what is passed on."""
@@ -282,3 +291,9 @@ class FlowLaws(ArcRates):
         """Append empty batch rows and the unit row to stocks of shape (stores, B)."""
         batch = stock.shape[1]
         return np.concatenate([stock, np.zeros((len(self.rows.batch_names), batch)), np.ones((1, batch))])
+
+
+def _in_interval(table: Floats, step: Integers) -> Floats:
+    """Return the values of controls, shape (controls, horizon), in an interval of each copy, shape (controls, B)."""
+    table = single_column(table)  # ``take`` would first write out what is broadcast
+    return table.take(step, axis=1) if table.shape[1] > 1 else np.repeat(table, len(step), axis=1)

@@ -127,9 +127,8 @@ class Supply:
     ) -> Floats:
         """Return what ``__call__`` does, for copies so few that all they take stays in a cache."""
         batch, count = controls.shape[1], len(self._demand)
-        low, high = (
-            table[self._rows].take(step, axis=1) for table in (self._dynamics.control_low, self._dynamics.control_high)
-        )
+        low = self._dynamics.control_low[self._rows].take(step, axis=1)
+        high = self._dynamics.capacity_in(step, factors)[self._rows]
         demand = self._factors(self._demand.take(step, axis=1), factors)
         most = np.zeros((count, batch))
         weights = np.broadcast_to(self._weights, low.shape)

@@ -14,7 +14,7 @@ from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import Law
 from cirl_marl.network.processes import interval_of
-from cirl_marl.network.uncertainty import factor_ranges, numbers_of, stated_means
+from cirl_marl.network.uncertainty import CAPACITY, factor_ranges, numbers_of, stated_means
 
 
 class IntervalFactors:
@@ -88,12 +88,20 @@ class RowFactors:
         return product
 
 
+def capacity_numbers(network: Network, ranges: Mapping[str, tuple[float, float]]) -> dict[int, int]:
+    """Return the rows of controls whose upper bounds are disturbed, with the rows of their factors."""
+    numbers = {**numbers_of(ranges, "nodes", CAPACITY), **numbers_of(ranges, "arcs", CAPACITY)}
+    return {network.control_rows[id_].start: number for id_, number in numbers.items()}
+
+
 class FlowFactors:
     """The arcs whose flow laws uncertain numbers multiply; shares are not among them (``shares``).
 
     Attributes:
         arcs: those arcs.
         highest: greatest factor on each, shape (arcs,).
+        capacity: of controls whose upper bounds are disturbed.
+        highest_capacity: greatest factor on each of these, shape (controls, 1).
     """
 
     def __init__(self, network: Network, ranges: Mapping[str, tuple[float, float]]) -> None:
@@ -117,6 +125,9 @@ class FlowFactors:
         ends = [*ranges.values()]
         extremes = [1 / ends[number][0] if inverse else ends[number][1] for _, number, inverse in entries]
         self.highest: Floats = np.array(extremes, dtype=float)
+        capacities = capacity_numbers(network, ranges)
+        self.capacity = RowFactors(capacities)
+        self.highest_capacity = np.array([ends[number][1] for number in capacities.values()]).reshape(-1, 1)
 
     def multiply(self, rate: Floats, factors: Floats) -> None:
         """Multiply what was drawn into the rates of arcs, shape (arcs, B), in place."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import ArrayLike, NDArray
 
+from cirl_marl.dynamics.uncertain_factors import RowFactors, capacity_numbers
 from cirl_marl.errors import CirlError, ControlError, unknown_name
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.rowsum import single_column, spans
@@ -27,8 +29,17 @@ class Actuators:
         spaces: action space of each agent.
     """
 
-    def __init__(self, network: Network, agents: Sequence[str] | None, num_envs: int) -> None:
-        """Let ``agents`` act, None being the network's own choice; a ``CirlError`` names one unknown or named twice."""
+    def __init__(
+        self,
+        network: Network,
+        agents: Sequence[str] | None,
+        num_envs: int,
+        ranges: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+    ) -> None:
+        """Let ``agents`` act, None being the network's own choice; a ``CirlError`` names one unknown or named twice.
+
+        ``ranges`` are those of the factors on what is disturbed, which ``step`` and others then bring.
+        """
         self.agents = _acting_agents(network, agents)
         self.num_envs = num_envs
         rows = {agent: network.control_rows[agent] for agent in self.agents}
@@ -38,27 +49,32 @@ class Actuators:
         self.spaces = {a: Box(-1.0, 1.0, (span.stop - span.start,), np.float32) for a, span in rows.items()}
         self._all_act = control_rows == list(range(network.control_bounds.shape[1]))
         low, neutral, high = (single_column(bound) for bound in network.control_bounds)
+        capacities, highest = capacity_numbers(network, ranges), high
+        self._all_capacities = RowFactors(capacities)
+        self._capacities = RowFactors(
+            {entry: capacities[row] for entry, row in enumerate(control_rows) if row in capacities}
+        )
         low, high = low[self.control_rows], high[self.control_rows]
-        tables: tuple[Floats, ...] = (low, (high + low) / 2, (high - low) / 2, high, neutral)
+        tables: tuple[Floats, ...] = (low, (high + low) / 2, (high - low) / 2, high, neutral, highest)
         self._vary_in_time = any(bool((table != table[:, :1]).any()) for table in tables)
         # one value per copy: NumPy takes equal shapes about twice as fast as it broadcasts a column
         first = np.zeros(num_envs, dtype=np.intp)
         if not self._vary_in_time:
             tables = tuple(table.take(first, axis=1) for table in tables)
-        *self._bounds, self._neutral = tables
+        *self._bounds, self._neutral, self._highest = tables
 
-    def neutral_action(self, step: Integers) -> dict[str, Floats]:
+    def neutral_action(self, step: Integers, factors: Floats | None = None) -> dict[str, Floats]:
         """Normalised action of each agent that leaves it neutral, shape (B, entries) each, in an interval of each."""
-        _, middle, half, _ = self._bounds_in(step)
-        neutral = self._neutral.take(step, axis=1) if self._vary_in_time else self._neutral
+        _, middle, half, _ = self._bounds_in(step, factors)
+        neutral = self._neutral_in(step, factors)
         distance = neutral[self.control_rows] - middle
         neutral = np.divide(distance, half, out=np.zeros_like(distance), where=half > 0)
         np.clip(neutral, -1.0, 1.0, out=neutral)  # rounding may lead beyond a bound
         return self.unstack(neutral)
 
-    def normalise(self, agent: str, values: Floats, step: Integers) -> Floats:
+    def normalise(self, agent: str, values: Floats, step: Integers, factors: Floats | None = None) -> Floats:
         """Return the actions that come closest to physical values of an agent's control, shape (its entries, B)."""
-        _, middle, half, _ = (table[self.entries[agent]] for table in self._bounds_in(step))
+        _, middle, half, _ = (table[self.entries[agent]] for table in self._bounds_in(step, factors))
         actions: Floats = np.divide(values - middle, half, out=np.zeros_like(values), where=half > 0)
         return np.clip(actions, -1.0, 1.0)
 
@@ -85,27 +101,40 @@ class Actuators:
         """Split stacked actions, shape (entries, B), into agent → (B, entries of its action)."""
         return {agent: actions[entries].T for agent, entries in self.entries.items()}
 
-    def controls(self, actions: Floats, step: Integers) -> Floats:
+    def controls(self, actions: Floats, step: Integers, factors: Floats | None = None) -> Floats:
         """Map stacked actions, (entries, B), to physical values of every control, (controls, B), or refuse them.
 
-        ``step``, shape (B,), is the index of the control interval in each copy.
+        ``step``, shape (B,), is the index of the control interval in each copy, and ``factors``, shape (numbers, B),
+        are those on what is disturbed there.
         """
         if not (actions.max(initial=0.0) <= BOUND and actions.min(initial=0.0) >= -BOUND):
             raise ControlError(self._wrong_values(actions))
-        low, middle, half, high = self._bounds_in(step)
+        low, middle, half, high = self._bounds_in(step, factors)
         values = actions * half
         values += middle
         np.maximum(values, low, out=values)  # with bounds that are arrays, clip is slower
         np.minimum(values, high, out=values)
         if self._all_act:
             return values
-        controls: Floats = self._neutral.take(step, axis=1) if self._vary_in_time else self._neutral.copy()
+        controls = self._neutral_in(step, factors).copy()
         controls[self.control_rows] = values
         return controls
 
-    def _bounds_in(self, step: Integers) -> Sequence[Floats]:
+    def _bounds_in(self, step: Integers, factors: Floats | None) -> Sequence[Floats]:
         """Return low, middle, half of the range and high of the agents' controls, shape (entries, B) each."""
-        return tuple(table.take(step, axis=1) for table in self._bounds) if self._vary_in_time else self._bounds
+        bounds = tuple(table.take(step, axis=1) for table in self._bounds) if self._vary_in_time else self._bounds
+        if factors is None or not len(self._capacities.rows):
+            return bounds
+        low, high = bounds[0], self._capacities(bounds[3], factors)
+        return low, (high + low) / 2, (high - low) / 2, high
+
+    def _neutral_in(self, step: Integers, factors: Floats | None) -> Floats:
+        """Return the values of all controls while nobody acts, shape (controls, B): at most their capacity."""
+        tables = self._neutral, self._highest
+        neutral, highest = (table.take(step, axis=1) for table in tables) if self._vary_in_time else tables
+        if factors is None or not len(self._all_capacities.rows):
+            return neutral
+        return np.minimum(neutral, self._all_capacities(highest, factors))
 
     def _wrong_agents(self, actions: Mapping[str, object]) -> str:
         for agent in actions:

@@ -244,14 +244,14 @@ class Credit:
     def _simulate_neutral(self, agents: Sequence[str], state: State, controls: Floats) -> Floats:
         # column i·B + b is copy b in which agent i is neutral
         dynamics, count, batch = self._dynamics, len(agents), controls.shape[1]
-        counterfactual, neutral = np.tile(controls, (1, count)), dynamics.neutral_in(state.step)
+        factors = dynamics.factors(state.factors, state.disturbances, state.step)
+        counterfactual, neutral = np.tile(controls, (1, count)), dynamics.neutral_in(state.step, factors)
         idle = np.repeat(self._supply.idle(self._agents), count * batch, axis=1)
         for i, agent in enumerate(agents):
             rows, columns = dynamics.network.control_rows[agent], slice(i * batch, (i + 1) * batch)
             counterfactual[rows, columns] = neutral[rows]
             idle[[arc == agent for arc in self._supply.arcs], columns] = True
         stock, inner, step = np.tile(state.stock, count), np.tile(state.inner, count), np.tile(state.step, count)
-        factors = dynamics.factors(state.factors, state.disturbances, state.step)
         factors = None if factors is None else np.tile(factors, count)
         counterfactual = self._supply(stock, inner, counterfactual, step, idle, factors)
         transition = dynamics.advance(stock, inner, counterfactual, step, factors)

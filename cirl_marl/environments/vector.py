@@ -131,7 +131,7 @@ class MultiAgentVectorEnv:
         self.uncertain = uncertain
         self.dynamics = Dynamics(variant, uncertain=uncertain)
         self.supply = Supply(self.dynamics)
-        self._actuators = Actuators(variant, agents, num_envs)
+        self._actuators = Actuators(variant, agents, num_envs, self.dynamics.factors.ranges)
         self.agents = self._actuators.agents
         self.action_spaces = self._actuators.spaces
         self.layout = ObservationLayout(self.dynamics, self.agents, observe, num_envs)
@@ -178,12 +178,15 @@ class MultiAgentVectorEnv:
         told only beside their actions.
         """
         step, state = self._next_interval(), self._state
-        joint: dict[str, Floats] = self._actuators.neutral_action(step) | {a: np.asarray(x) for a, x in actions.items()}
+        factors = None if state is None else self.factors_in(step)
+        joint: dict[str, Floats] = self._actuators.neutral_action(step, factors) | {
+            a: np.asarray(x) for a, x in actions.items()
+        }
         suppliers = [arc for arc in self.supply.arcs if arc in self.agents and arc not in actions]
         if suppliers and state is not None and (state.step < self.network.episode.horizon).all():
-            controls = self._actuators.controls(self.stack(joint), step)
+            controls = self._actuators.controls(self.stack(joint), step, factors)
             idle = self.supply.idle([agent for agent in self.agents if agent not in suppliers])
-            controls = self.supply(state.stock, state.inner, controls, step, idle, self.factors_in(step))
+            controls = self.supply(state.stock, state.inner, controls, step, idle, factors)
             for arc in suppliers:
                 joint[arc] = self.normalise(arc, controls[self.network.control_rows[arc]])
         return joint
@@ -193,7 +196,9 @@ class MultiAgentVectorEnv:
 
         Values have shape (entries of its action, num_envs), actions (num_envs, entries).
         """
-        return self._actuators.normalise(agent, values, self._next_interval()).T
+        step = self._next_interval()
+        factors = None if self._state is None else self.factors_in(step)
+        return self._actuators.normalise(agent, values, step, factors).T
 
     @property
     def physical(self) -> State:
@@ -335,8 +340,8 @@ class MultiAgentVectorEnv:
         horizon = self.network.episode.horizon
         if (state.step >= horizon).any():
             raise ControlError(f"the episode is over after {horizon} steps: call reset()")
-        controls = self._actuators.controls(actions, state.step)
         factors = self.factors_in(state.step)
+        controls = self._actuators.controls(actions, state.step, factors)
         controls = self.controls = self.supply(state.stock, state.inner, controls, state.step, self._idle, factors)
         transition = dynamics.advance(state.stock, state.inner, controls, state.step, factors)
         quantities, flow = self._measure(transition, controls)
@@ -361,8 +366,9 @@ class MultiAgentVectorEnv:
         state = self.physical
         done = np.maximum(state.step - 1, 0)  # the interval that the state is scored in
         quantities = self._quantities(state)
-        inner = self.dynamics.inner.rewards(state.inner, state.inner, self.dynamics.neutral_in(done))
-        levels = self.scoring.levels(quantities, done, self.factors_in(done))
+        factors = self.factors_in(done)
+        inner = self.dynamics.inner.rewards(state.inner, state.inner, self.dynamics.neutral_in(done, factors))
+        levels = self.scoring.levels(quantities, done, factors)
         rewards = self.scoring.local_of_all(self.scoring.terms(quantities, levels, inner))
         return dict(zip(self.network.compartments, rewards, strict=True))
 
@@ -448,7 +454,7 @@ class MultiAgentVectorEnv:
         stock, step = dynamics.extend(stocks), np.zeros(batch, dtype=np.intp)
         scales = dynamics.factors(factors, paths.values, step)
         idle = np.ones((len(self.supply.arcs), 1), dtype=bool)
-        neutral = self.supply(stock, inner, dynamics.neutral_in(step), step, idle, scales)
+        neutral = self.supply(stock, inner, dynamics.neutral_in(step, scales), step, idle, scales)
         flow, measures = dynamics.start_flow(stock, inner, neutral, scales), dynamics.inner.measures(inner, neutral)
         batched, circularity = np.zeros((2, batch)), np.zeros(batch)
         service = np.zeros((len(self.network.services), batch))

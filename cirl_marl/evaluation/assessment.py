@@ -92,7 +92,7 @@ def evaluate(
 
     Args:
         run: directory of a training run.
-        episodes: how many, at least 2; None: 64, or 256 of a network that is disturbed.
+        episodes: how many, at least 2; None: 64, or of a disturbed network as many as ``compare`` takes.
         seed: different seeds share no episode.
         bounds: whether to hold the episodes against the best possible, which takes longer than the episodes.
         progress: called with what is being done and the share of all that is done.

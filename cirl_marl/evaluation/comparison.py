@@ -10,12 +10,14 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cirl_marl.controllers.basic import Controller
 from cirl_marl.controllers.rollout import Rollout, first_seed, rollout
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.baselines import Baseline, bounds_of_draws, solve_baseline
-from cirl_marl.evaluation.contenders import contenders
+from cirl_marl.evaluation.contenders import Contender, contenders
+from cirl_marl.evaluation.episode_count import MOST_EPISODES, enough_episodes, joined, undecided
 from cirl_marl.evaluation.figures import gain
 from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, SHARE, Aggregate, over_episodes, over_seeds, worst_mean
 from cirl_marl.learners.run_directory import RunDirectory
@@ -29,8 +31,6 @@ LIMITS = {"service": SHARE, "gap": (0.0, np.inf)}
 """Within which figures lie: the bound is proved, so that no gap is below 0."""
 SOLVER_SHARE = 0.7
 """Share of solving programs in the work on bounds; the rest is to evaluate their multipliers for every episode."""
-EPISODES_DISTURBED = 256
-"""Episodes from which on something can be said of the 5 % worst."""
 ProgressReport = Callable[[str, float], None]
 """Takes what is being done and the share of all that is done."""
 
@@ -110,6 +110,7 @@ class Comparison:
     """What every policy and controller did in the same episodes; episode i starts from seed ``first_seed + i``.
 
     The network is under its scenario and horizon, and ``baseline`` has the bounds that the entries are held against.
+    ``undecided`` names the pairs that the episodes do not tell apart, if their number was left to what they say.
     """
 
     network: Network
@@ -117,6 +118,7 @@ class Comparison:
     first_seed: int
     entries: tuple[Entry, ...]
     baseline: Baseline
+    undecided: tuple[str, ...] | None = None
 
     @property
     def episodes(self) -> int:
@@ -155,7 +157,8 @@ def compare(
         controllers: names of controllers, see ``optimum.registry``.
         network: catalogue name, definition file or network; None is that of the first run.
         scenario: of ``network``; None is the default.
-        episodes: at least 2; None: 64, or 256 of a network that is disturbed.
+        episodes: at least 2; None: 64, or of a network that is disturbed 256, and twice and four times as many while
+            the interval of a difference between two rows is wider than that (``episode_count.undecided``).
         seed: different seeds share no episode.
         min_service: mean level of every service, or of each, shape (services,), that ``mpc`` and ``optimum`` plan for;
             None: as much as can be had.
@@ -184,16 +187,13 @@ def compare(
         min_service,
         uncertain,
     )
+    adapts, first = episodes is None and bool(env.network.disturbed), first_seed(seed)
     episodes = enough_episodes(env.network) if episodes is None else episodes
-    first = first_seed(seed)
     share = 1 / (len(candidates) + (len({who_acts.name for who_acts in candidates}) if bounds else 0))
-    rollouts, checkpoints = [], []
-    for place, contender in enumerate(candidates):
-        controller = contender.controller()
-        checkpoints.append(controller.checkpoint.name if isinstance(controller, Trained) else "")
-        report = part_of(progress, contender.name, place * share, share)
-        rollouts.append(rollout(contender.env(episodes), controller, seed=first, progress=report))
-    baseline = Baseline()
+    actors = [(contender, contender.controller()) for contender in candidates]
+    checkpoints = [actor.checkpoint.name if isinstance(actor, Trained) else "" for _, actor in actors]
+    rollouts, unclear = _played(actors, first, episodes, adapts=adapts, share=share, progress=progress)
+    episodes, baseline = len(rollouts[0].circularity), Baseline()
     bounds_by_entry: list[Floats | None] = [None] * len(candidates)
     if bounds:
         first_env, done = candidates[0].env(episodes), len(candidates) * share
@@ -218,12 +218,35 @@ def compare(
         Entry(candidate.name, candidate.seed, candidate.run, checkpoint, run, gain(run, neutral), bound)
         for candidate, checkpoint, run, bound in zip(candidates, checkpoints, rollouts, bounds_by_entry, strict=True)
     )
-    return Comparison(env.network, env.agents, first, entries, baseline)
+    return Comparison(env.network, env.agents, first, entries, baseline, unclear if adapts else None)
 
 
-def enough_episodes(network: Network, *, certain: int = 64) -> int:
-    """Return how many episodes say enough of a network: of one that is disturbed more than of a ``certain`` one."""
-    return EPISODES_DISTURBED if network.disturbed else certain
+def _played(
+    actors: Sequence[tuple[Contender, Controller]],
+    first: int,
+    episodes: int,
+    *,
+    adapts: bool,
+    share: float,
+    progress: ProgressReport,
+) -> tuple[list[Rollout], tuple[str, ...]]:
+    """Return the episodes of each, with ``adapts`` as many as it takes, and which pairs they do not tell apart."""
+    rollouts: list[Rollout] = []
+    while True:
+        done = len(rollouts[0].circularity) if rollouts else 0
+        more = []
+        for place, (contender, controller) in enumerate(actors):
+            activity = f"{contender.name}, {episodes} more episodes" if done else contender.name
+            report = part_of(progress, activity, place * share, share)
+            run = rollout(contender.env(episodes), controller, seed=first + done, progress=report)
+            more.append(joined(rollouts[place], run) if done else run)
+        rollouts, by_row = more, dict[str, list[Rollout]]()
+        for (contender, _), run in zip(actors, rollouts, strict=True):
+            by_row.setdefault(contender.name, []).append(run)
+        unclear = tuple(undecided(actors[0][0].env(1).network, by_row)) if adapts else ()
+        episodes = len(rollouts[0].circularity)
+        if not unclear or 2 * episodes > MOST_EPISODES:
+            return rollouts, unclear
 
 
 def starting_stocks(env: MultiAgentVectorEnv, seed: int) -> Floats:

@@ -31,7 +31,7 @@ from cirl_marl.network.rowsum import Floats, Integers, RowSum, spans
 from cirl_marl.network.series import Series
 from cirl_marl.network.specification import Specification
 from cirl_marl.network.split_fractions import Split, splits
-from cirl_marl.network.uncertainty import CERTAIN, factor_ranges
+from cirl_marl.network.uncertainty import CAPACITY, CERTAIN, factor_ranges
 from cirl_marl.network.validation import problems
 
 if TYPE_CHECKING:
@@ -150,9 +150,12 @@ class Network(Specification):
                 base = self.interval_means(arc.flow) * ranges.get(f"arcs.{arc.id}.flow", CERTAIN)[1]
                 base = np.ones_like(base) if arc.law is Law.CONTROLLED else base
                 # a valve on the donor scales all its outflows, a control that sets a flow is of the controlled one
-                sets = [c.control for c in (arc, donor) if c.control is not None]
-                actuators = (c for c in sets if c.kind is ControlKind.RATE or arc.law is Law.CONTROLLED)
-                factors = [self.interval_means(control.high) for control in actuators]
+                sets = [(f"arcs.{arc.id}", arc.control), (f"nodes.{donor.id}", donor.control)]
+                factors = [
+                    self.interval_means(control.high) * ranges.get(f"{path}.{CAPACITY}", CERTAIN)[1]
+                    for path, control in sets
+                    if control is not None and (control.kind is ControlKind.RATE or arc.law is Law.CONTROLLED)
+                ]
                 demand = np.prod([base, *factors], axis=0).sum() * self.episode.control_interval
                 initial[:, self.node_index[arc.donor]] += demand * (1 + RESERVE)
         return _read_only(initial)

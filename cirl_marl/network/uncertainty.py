@@ -12,9 +12,9 @@ from scipy import special
 
 from cirl_marl.errors import unknown_name
 from cirl_marl.network.declarations import CheckedRecord, Positive, Quantity, Word, declarations, frozen_record
-from cirl_marl.network.elements import FIXED_LIFETIME, Arc, Law, Node, Service
+from cirl_marl.network.elements import FIXED_LIFETIME, Arc, ControlKind, Law, Node, Service
 from cirl_marl.network.rowsum import Floats
-from cirl_marl.network.series import Series, extremes, in_intervals
+from cirl_marl.network.series import Series, Value, extremes, in_intervals
 from cirl_marl.network.specification import Specification
 from cirl_marl.network.split_fractions import proportions, splits
 
@@ -25,6 +25,8 @@ CERTAIN = (1.0, 1.0)
 """Range of the factor on a number that is certain."""
 KINDS: Mapping[str, type[Any]] = {"nodes": Node, "arcs": Arc, "services": Service}
 """Parts of a network whose numbers may be uncertain, by the key of their table."""
+CAPACITY = "control.high"
+"""What a disturbance may lower, or raise, of an actuator, as the last part of a path: its upper bound."""
 
 
 @frozen_record
@@ -116,8 +118,7 @@ def _factor_range(network: Specification, path: str, *, with_draws: bool = True)
 
 def stated_means(network: Specification, path: str) -> Floats:
     """Return the number at a path as it is stated, its mean in each control interval, shape (horizon,)."""
-    part, name = _uncertain_field(network, path)
-    return network.interval_means(getattr(part, name))
+    return network.interval_means(_number(*_uncertain_field(network, path)))
 
 
 def numbers_of(paths: Iterable[str], kind: str, field: str) -> dict[str, int]:
@@ -139,9 +140,9 @@ def uncertainty_problems(network: Specification) -> Iterator[str]:
             yield f"{path}: {error.args[0]}"
             continue
         mistakes = list(network.uncertain[path].problems()) if path in network.uncertain else []
-        if not mistakes and not all(map(math.isfinite, extremes(getattr(part, name)))):
+        if not mistakes and not all(map(math.isfinite, extremes(_number(part, name)))):
             mistakes = ["it is infinite, and so is every draw; give the number"]
-        if not mistakes and extremes(getattr(part, name)) == (0.0, 0.0):
+        if not mistakes and extremes(_number(part, name)) == (0.0, 0.0):
             mistakes = ["it is 0, and so is every draw; give the number"]
         if not mistakes and path in network.disturbed and network.disturbed[path].adds:
             if (stated_means(network, path) <= 0).any():
@@ -160,6 +161,8 @@ def _undrawable(network: Specification, part: Any, name: str, path: str) -> Iter
         yield f"only a lifetime with a deviation can be stretched{' or disturbed' if disturbed else ''}"
     elif name == "stretch" and low <= 0:
         yield "some draws are 0; give a range above it"
+    elif name == CAPACITY and (mistake := _lost_capacity(network, part, path)):
+        yield mistake
     elif low < 0:
         by = f"disturbed by '{disturbed.by}' " if disturbed else ""
         yield f"{by}it may be {low:.3g} times what is stated; it cannot be negative: give a higher 'low'"
@@ -173,6 +176,29 @@ def _undrawable(network: Specification, part: Any, name: str, path: str) -> Iter
             if (bands[0] > bands[1]).any():
                 by = f"disturbed by '{disturbed.by}': " if disturbed else ""
                 yield f"{by}some draws turn the band upside down; give ranges that do not overlap"
+
+
+def _lost_capacity(network: Specification, part: Any, path: str) -> str:
+    """Return why the upper bound of a control cannot be disturbed, or nothing."""
+    control, remedies = (
+        part.control,
+        {
+            ControlKind.SHARE: "shares are parts of a whole; disturb an uncontrolled share, or what the donor releases",
+            ControlKind.STRETCH: "disturb the stretch of the node",
+            ControlKind.INPUT: "the input of a model is no capacity",
+        },
+    )
+    if path in network.uncertain:
+        return "the bound of a control can be disturbed in time, but not drawn"
+    if control.kind in remedies:
+        return f"a control of kind '{control.kind}' has no capacity: {remedies[control.kind]}"
+    lowest, most = network.interval_means(control.low), network.interval_means(control.high)
+    worst = int(np.argmin(most * _factor_range(network, path)[0] - lowest))
+    capacity = float(most[worst]) * _factor_range(network, path)[0]
+    if capacity < lowest[worst]:
+        by = network.disturbed[path].by
+        return f"disturbed by '{by}' it may be {capacity:.3g}, below control.low {lowest[worst]:.3g}; lower that"
+    return ""
 
 
 def _move_together(network: Specification, low: str, high: str) -> bool:
@@ -194,12 +220,15 @@ def draw_network(network: Any, factors: Sequence[float] = (), path: Floats | Non
             names); if something is disturbed. What they are expected to be gives the network that is expected.
     """
     changes: dict[int, tuple[Any, dict[str, Any]]] = {}
+    interval = network.episode.control_interval
 
     def change(part: Any, name: str, value: Any) -> None:
+        if name == CAPACITY:  # who stays neutral takes at most what there is
+            neutral = np.minimum(network.interval_means(part.control.neutral), network.interval_means(value))
+            name, value = "control", replace(part.control, high=value, neutral=in_intervals(neutral, interval))
         changes.setdefault(id(part), (part, {}))[1][name] = value
 
     drawn = dict(zip(network.uncertain, factors, strict=True)) if len(factors) else {}
-    interval = network.episode.control_interval
     for number, factor in drawn.items():
         part, name = _uncertain_field(network, number)
         value = getattr(part, name)
@@ -272,15 +301,23 @@ def _uncertain_field(network: Specification, path: str) -> tuple[Any, str]:
         for field, declaration in fields.items()
         if isinstance(declaration, Quantity) and declaration.varies and not declaration.past
     ]
+    options += [CAPACITY] * ("control" in fields)
     if name not in options:
         raise KeyError(f"of {kind} these can be uncertain: {', '.join(options)}; '{name}' cannot")
-    if getattr(parts[id_], name) is None:
+    if name == CAPACITY and parts[id_].control is None:
+        raise KeyError("it has no control")
+    if _number(parts[id_], name) is None:
         raise KeyError(f"'{name}' is not given, so that nothing can be drawn")
     return parts[id_], name
 
 
+def _number(part: Any, name: str) -> Value:
+    """Return the number that a field of a part is, or the upper bound of its control."""
+    value: Value = part.control.high if name == CAPACITY else getattr(part, name)
+    return value
+
+
 def _split(path: str) -> tuple[str, str, str]:
     """Return kind, id and field of a path."""
-    kind, _, rest = path.partition(".")
-    id_, _, name = rest.rpartition(".")
+    kind, id_, name = [*path.split(".", 2), "", ""][:3]
     return kind, id_, name

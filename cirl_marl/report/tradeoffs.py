@@ -11,6 +11,7 @@ import numpy as np
 from rich.table import Table
 
 from cirl_marl.evaluation.comparison import FIGURES, Comparison
+from cirl_marl.evaluation.episode_count import EPISODES_DISTURBED, MOST_EPISODES
 from cirl_marl.evaluation.figures import provenance
 from cirl_marl.evaluation.pareto import ParetoFront
 from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, Aggregate, finite_or_none, interquartile_mean
@@ -75,6 +76,13 @@ def _worst(comparison: Comparison) -> list[list[str]]:
 def comparison_notes(comparison: Comparison) -> list[str]:
     """Return what the reader of a comparison's table has to know."""
     notes, baseline = [], comparison.baseline
+    if comparison.undecided is not None:
+        reason = (
+            f"episodes: {comparison.episodes}, doubled from {EPISODES_DISTURBED} to at most {MOST_EPISODES:,} while"
+        )
+        notes.append(f"{reason} the interval of a difference between two rows is wider than the difference")
+    if comparison.undecided:
+        notes.append(f"not told apart: {', '.join(comparison.undecided)}")
     if any(row.seeds for row in comparison.rows):
         notes.append(
             "trained: interquartile mean over training seeds, bootstrap over seeds; controllers: mean over episodes, "
@@ -152,6 +160,7 @@ def summary_of(comparison: Comparison, **options: Any) -> dict[str, Any]:
         "unit": comparison.network.mass_unit,
         "agents": list(comparison.agents),
         "episodes": comparison.episodes,
+        "undecided": None if comparison.undecided is None else list(comparison.undecided),
         "first_seed": comparison.first_seed,
         "no_bound": comparison.baseline.reason or None,
         "front": [{"service": level, "bound": bound} for level, bound in comparison.baseline.front.tolist()],
