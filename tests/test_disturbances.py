@@ -633,7 +633,7 @@ def test_the_worst_episodes_are_told(tmp_path: Path) -> None:
     assert worst_mean(np.array([3.0, 1.0, 2.0])).value == 1.0
     network = line(EVERYWHERE)
     comparison = compare((), ("neutral",), network=network, bounds=False)
-    assert comparison.episodes == 256 and comparison.undecided == ()
+    assert comparison.episodes == 256 and comparison.ties == ()
     assert compare((), ("neutral",), network=line({}), bounds=False).episodes == 64
     (row,) = comparison.rows
     kept = comparison.entries[0].rollout
@@ -700,11 +700,11 @@ def test_episodes_are_added_until_differences_can_be_told() -> None:
     disturbed = {"arcs.melt.rate": DisturbanceEffect(by="outage")}
     network = replace(works(4.5), disturbances={"outage": outage}, disturbed=disturbed, default_agents=("dig",))
     clear = compare((), ("neutral", "scripted"), network=replace(network, default_agents=()), bounds=False)
-    assert clear.episodes == 256 and clear.undecided == ()
+    assert clear.episodes == 256 and clear.ties == ()
     unclear = compare((), ("random",), network=network, bounds=False)
     assert unclear.episodes > 256
     whole = compare((), ("random",), network=network, bounds=False, episodes=unclear.episodes)
-    assert whole.undecided is None
+    assert whole.ties is None
     entry, other = unclear.entries[0], whole.entries[0]
     assert entry.name == "neutral" and unclear.entries[1].name == "random"
     for name in ("circularity_mean", "levels", "disturbances", "returns", "flow"):

@@ -17,7 +17,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.baselines import Baseline, bounds_of_draws, solve_baseline
 from cirl_marl.evaluation.contenders import Contender, contenders
-from cirl_marl.evaluation.episode_count import MOST_EPISODES, enough_episodes, joined, undecided
+from cirl_marl.evaluation.episode_count import MOST_EPISODES, concatenation, enough_episodes, ties
 from cirl_marl.evaluation.figures import gain
 from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, SHARE, Aggregate, over_episodes, over_seeds, worst_mean
 from cirl_marl.learners.run_directory import RunDirectory
@@ -110,7 +110,7 @@ class Comparison:
     """What every policy and controller did in the same episodes; episode i starts from seed ``first_seed + i``.
 
     The network is under its scenario and horizon, and ``baseline`` has the bounds that the entries are held against.
-    ``undecided`` names the pairs that the episodes do not tell apart, if their number was left to what they say.
+    ``ties`` names the pairs that the episodes do not tell apart, if their number was left to what they say.
     """
 
     network: Network
@@ -118,7 +118,7 @@ class Comparison:
     first_seed: int
     entries: tuple[Entry, ...]
     baseline: Baseline
-    undecided: tuple[str, ...] | None = None
+    ties: tuple[str, ...] | None = None
 
     @property
     def episodes(self) -> int:
@@ -158,7 +158,7 @@ def compare(
         network: catalogue name, definition file or network; None is that of the first run.
         scenario: of ``network``; None is the default.
         episodes: at least 2; None: 64, or of a network that is disturbed 256, and twice and four times as many while
-            the interval of a difference between two rows is wider than that (``episode_count.undecided``).
+            the interval of a difference between two rows is wider than that (``episode_count.ties``).
         seed: different seeds share no episode.
         min_service: mean level of every service, or of each, shape (services,), that ``mpc`` and ``optimum`` plan for;
             None: as much as can be had.
@@ -192,7 +192,7 @@ def compare(
     share = 1 / (len(candidates) + (len({who_acts.name for who_acts in candidates}) if bounds else 0))
     actors = [(contender, contender.controller()) for contender in candidates]
     checkpoints = [actor.checkpoint.name if isinstance(actor, Trained) else "" for _, actor in actors]
-    rollouts, unclear = _played(actors, first, episodes, adapts=adapts, share=share, progress=progress)
+    rollouts, unclear = _play(actors, first, episodes, adapts=adapts, share=share, progress=progress)
     episodes, baseline = len(rollouts[0].circularity), Baseline()
     bounds_by_entry: list[Floats | None] = [None] * len(candidates)
     if bounds:
@@ -221,7 +221,7 @@ def compare(
     return Comparison(env.network, env.agents, first, entries, baseline, unclear if adapts else None)
 
 
-def _played(
+def _play(
     actors: Sequence[tuple[Contender, Controller]],
     first: int,
     episodes: int,
@@ -239,11 +239,11 @@ def _played(
             activity = f"{contender.name}, {episodes} more episodes" if done else contender.name
             report = part_of(progress, activity, place * share, share)
             run = rollout(contender.env(episodes), controller, seed=first + done, progress=report)
-            more.append(joined(rollouts[place], run) if done else run)
+            more.append(concatenation(rollouts[place], run) if done else run)
         rollouts, by_row = more, dict[str, list[Rollout]]()
         for (contender, _), run in zip(actors, rollouts, strict=True):
             by_row.setdefault(contender.name, []).append(run)
-        unclear = tuple(undecided(actors[0][0].env(1).network, by_row)) if adapts else ()
+        unclear = tuple(ties(actors[0][0].env(1).network, by_row)) if adapts else ()
         episodes = len(rollouts[0].circularity)
         if not unclear or 2 * episodes > MOST_EPISODES:
             return rollouts, unclear

@@ -23,7 +23,7 @@ def enough_episodes(network: Network, *, certain: int = 64) -> int:
     return EPISODES_DISTURBED if network.disturbed else certain
 
 
-def undecided(network: Network, rollouts: Mapping[str, Sequence[Rollout]]) -> Iterator[str]:
+def ties(network: Network, rollouts: Mapping[str, Sequence[Rollout]]) -> Iterator[str]:
     """Yield pairs of rows, neighbours in a figure, of which the episodes do not tell which has more.
 
     That is where the 95 % interval of the mean difference, episode by episode, is wider to either side than the
@@ -46,7 +46,7 @@ def undecided(network: Network, rollouts: Mapping[str, Sequence[Rollout]]) -> It
                 yield f"{lower} and {upper} ({figure})"
 
 
-def joined(first: Rollout, second: Rollout) -> Rollout:
+def concatenation(first: Rollout, second: Rollout) -> Rollout:
     """Return the episodes of two rollouts of one controller as one; what is of the first copy is of the first."""
     share = len(first.circularity) / (len(first.circularity) + len(second.circularity))
     along = {"circularity": 0, "circularity_mean": 0, "service": 0, "levels": 0, "disturbances": 0}

@@ -124,7 +124,7 @@ class DisturbanceProcesses:
                 latent = self._memory * latent + self._innovation * self._mix(noise[t, self._rows])
                 states[t, self._rows] = latent
         for n, process in self._others:
-            process.follow(special.ndtr(noise[:, n]), states[:, n])
+            process.follow(noise[:, n], states[:, n])
         return Paths(states, self._values(states, self._offset_table(steps)))
 
     def values(self, states: Floats, step: int) -> Floats:
@@ -209,19 +209,20 @@ class _Chain:
 
     def __init__(self, chain: Markov) -> None:
         self.values, self._matrix = np.array(chain.values), chain.transitions
-        self._sums = self._matrix.cumsum(axis=1)
         shares = chain.stationary
         self.first_shares = shares if chain.start is None else np.eye(len(shares))[chain.start - 1]
+        # a normal draw leads past so many of the others as its quantile is beyond their probabilities together
+        self._bounds, self._first_bounds = (_normal_bounds(table) for table in (self._matrix, self.first_shares))
 
-    def follow(self, chance: Floats, states: Floats) -> None:
-        """Write the regimes that even draws from [0, 1] give, shape (steps, B) both."""
-        steps, copies = chance.shape
-        # where each regime would go, shape (steps, regimes, B); sums of probabilities may round to less than 1
+    def follow(self, noise: Floats, states: Floats) -> None:
+        """Write the regimes that standard normal draws give, shape (steps, B) both."""
+        steps, copies = noise.shape
+        # where each regime would go, shape (steps, regimes, B)
         ways = np.zeros((steps, len(self.values), copies), dtype=np.intp)
-        for i, sums in enumerate(self._sums[:, :-1]):
-            for bound in sums:
-                ways[:, i] += chance >= bound
-        regime = (chance[0] >= self.first_shares.cumsum()[:-1, None]).sum(axis=0)
+        for i, bounds in enumerate(self._bounds):
+            for bound in bounds:
+                ways[:, i] += noise >= bound
+        regime = (noise[0] >= self._first_bounds[:, None]).sum(axis=0)
         states[0], column = regime, np.arange(copies)
         for t in range(1, steps):
             regime = ways[t].take(regime * copies + column)
@@ -242,9 +243,9 @@ class _Record:
         self.values, self._leave = np.array(record.values), 1.0 / record.block
         self.first_shares = np.full(len(self.values), 1.0 / len(self.values))
 
-    def follow(self, chance: Floats, states: Floats) -> None:
-        """Write the places that even draws from [0, 1] give, shape (steps, B) both."""
-        size = len(self.values)
+    def follow(self, noise: Floats, states: Floats) -> None:
+        """Write the places that standard normal draws give, shape (steps, B) both."""
+        size, chance = len(self.values), special.ndtr(noise)
         # below 1/block a draw begins a block, and says where
         begins, scaled = chance < self._leave, chance * (size / self._leave)
         states[0] = np.minimum(np.floor(chance[0] * size), size - 1)
@@ -256,6 +257,12 @@ class _Record:
         """Return E[ξ_{t+k}] by the place in t, for k = 0 … ``ahead``, shape (places,) each."""
         stays, mean = 1.0 - self._leave, self.values.mean()
         return [stays**k * np.roll(self.values, -k) + (1.0 - stays**k) * mean for k in range(ahead + 1)]
+
+
+def _normal_bounds(shares: Floats) -> Floats:
+    """Return the standard normal quantiles of sums of all shares but the last, along the last axis."""
+    sums = np.minimum(shares.cumsum(axis=-1)[..., :-1], 1.0)  # they may round to more than 1
+    return np.asarray(special.ndtri(sums))
 
 
 def _clipped_means(middle: Floats, deviation: Floats, low: Floats, high: Floats, *, is_log: bool) -> Floats:

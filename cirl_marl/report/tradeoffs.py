@@ -76,13 +76,13 @@ def _worst(comparison: Comparison) -> list[list[str]]:
 def comparison_notes(comparison: Comparison) -> list[str]:
     """Return what the reader of a comparison's table has to know."""
     notes, baseline = [], comparison.baseline
-    if comparison.undecided is not None:
+    if comparison.ties is not None:
         reason = (
             f"episodes: {comparison.episodes}, doubled from {EPISODES_DISTURBED} to at most {MOST_EPISODES:,} while"
         )
         notes.append(f"{reason} the interval of a difference between two rows is wider than the difference")
-    if comparison.undecided:
-        notes.append(f"not told apart: {', '.join(comparison.undecided)}")
+    if comparison.ties:
+        notes.append(f"not told apart: {', '.join(comparison.ties)}")
     if any(row.seeds for row in comparison.rows):
         notes.append(
             "trained: interquartile mean over training seeds, bootstrap over seeds; controllers: mean over episodes, "
@@ -160,7 +160,7 @@ def summary_of(comparison: Comparison, **options: Any) -> dict[str, Any]:
         "unit": comparison.network.mass_unit,
         "agents": list(comparison.agents),
         "episodes": comparison.episodes,
-        "undecided": None if comparison.undecided is None else list(comparison.undecided),
+        "ties": None if comparison.ties is None else list(comparison.ties),
         "first_seed": comparison.first_seed,
         "no_bound": comparison.baseline.reason or None,
         "front": [{"service": level, "bound": bound} for level, bound in comparison.baseline.front.tolist()],
