@@ -23,8 +23,7 @@ EXAMPLE = Path(__file__).parent.parent / "examples" / "metal_cycle.toml"
 def planned(network: str, held: dict[str, float], scenario: str | None = None) -> Schedule:
     """Return an episode in which some agents hold an action and the others are neutral."""
     env = MultiAgentVectorEnv(network, num_envs=1, scenario=scenario)
-    neutral = {agent: float(action[0, 0]) for agent, action in env.neutral_action.items()}
-    return schedule(env, Constant({**neutral, **held}))
+    return schedule(env, Constant(held))
 
 
 def test_levers_are_said_in_words() -> None:
