@@ -25,7 +25,8 @@ def write_schemas() -> None:
 def network_schema() -> dict[str, Any]:
     """Return the JSON schema of definition files, with which editors complete and check them.
 
-    A scenario may give any part of a network, so in its branch nothing is required.
+    A scenario may give any part of a network, so in its branch nothing is required, and what it gives of a number may
+    be of several forms.
     """
     schema = NetworkTable.model_json_schema(by_alias=True)
     definitions = schema["$defs"]
@@ -33,7 +34,9 @@ def network_schema() -> dict[str, Any]:
     def part(value: Any) -> Any:
         if isinstance(value, dict):
             return {
-                key: f"{item}Part" if key == "$ref" and item.split("/")[-1] in tables else part(item)
+                "anyOf" if key == "oneOf" else key: f"{item}Part"
+                if key == "$ref" and item.split("/")[-1] in tables
+                else part(item)
                 for key, item in value.items()
                 if not (key == "required" and isinstance(item, list))
             }
