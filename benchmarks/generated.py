@@ -138,6 +138,50 @@ def yearly_network(*, monthly: bool = False, regions: int = 33, seed: int = 0) -
     )
 
 
+def market_network(markets: int, *, every: int = 3, skew: float = 0.8, seed: int = 0) -> Network:
+    """Return markets without stock that pass to each other at random, with a fifth as many stocks in use.
+
+    Each passes to three others and to a stock, which returns it after 5 to 30 years. The chance to be passed to falls
+    with the number of a market to the power of ``skew``: the first ones are hubs.
+
+    Args:
+        markets: number of markets.
+        every: every so manieth market has an agent, who sets its first share; 0 for none.
+        skew: 0 makes all alike.
+        seed: of all that is drawn.
+    """
+    random = np.random.default_rng(seed)
+    stocks = max(2, markets // 5)
+    chances = np.arange(1, markets + 1) ** -skew
+    asked = Control(kind=ControlKind.SHARE, low=0.05, neutral=0.1, high=0.3)
+    residence = random.uniform(5.0, 30.0, stocks).tolist()
+    nodes = [Node(id=f"stock_{i}", initial=(50.0, 150.0), rate=1.0 / years) for i, years in enumerate(residence)]
+    nodes += [Node(id=f"market_{i}", stores=False) for i in range(markets)]
+    nodes.append(Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR))
+    arcs = [Arc(id="feed", donor="mine", recipient="market_0", law=Law.EXOGENOUS, flow=7.0)]
+    ends: list[tuple[str, int]] = [(f"stock_{i}", int(random.integers(markets))) for i in range(stocks)]
+    arcs += [Arc(id=f"{id_}_out", donor=id_, recipient=f"market_{j}", law=Law.SHARE) for id_, j in ends]
+    for i in range(markets):
+        drawn = random.choice(markets, size=3, p=chances / chances.sum())
+        others = [int(j) for j in dict.fromkeys(drawn.tolist()) if j != i]
+        # what a control takes is left over
+        parts = (0.6 * random.dirichlet(np.ones(len(others) + 1))[1:]).tolist()
+        for n, (j, part) in enumerate(zip(others, parts, strict=True)):
+            chosen: dict[str, Any] = {"control": asked} if every and i % every == 0 and n == 0 else {"share": part}
+            arcs.append(
+                Arc(id=f"market_{i}_to_{j}", donor=f"market_{i}", recipient=f"market_{j}", law=Law.SHARE, **chosen)
+            )
+        used = f"stock_{random.integers(stocks)}"
+        arcs.append(Arc(id=f"market_{i}_to_use", donor=f"market_{i}", recipient=used, law=Law.SHARE))
+    return Network(
+        name="markets",
+        nodes=tuple(nodes),
+        arcs=tuple(arcs),
+        episode=Episode(control_interval=1.0, horizon=30),
+        time_unit="year",
+    )
+
+
 def simple_spread(copies: int, agents: int) -> Callable[[], object] | None:
     """Return what steps VMAS's ``simple_spread`` once, with random continuous actions; None if VMAS is missing."""
     try:

@@ -13,10 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from benchmarks.generated import yearly_network
+from benchmarks.generated import market_network, yearly_network
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, MultiAgentVectorEnv, Network, Node, Role, Series
-from cirl_marl.dynamics.elimination import SparseRow, StaticElimination, contract_hubs, square_matrix
+from cirl_marl.dynamics.elimination import visits
 from cirl_marl.dynamics.integrator import Dynamics
+from cirl_marl.dynamics.static_elimination import SparseRow, StaticElimination, contract_hubs, square_matrix
 from cirl_marl.network import RowSum
 
 Floats = NDArray[np.float64]
@@ -53,7 +54,7 @@ def keeping(kept: Iterable[int]) -> Any:
     eliminate, kept = StaticElimination._eliminate, set(kept)
 
     def chosen(self: StaticElimination, constant: set[int]) -> None:
-        with patch("cirl_marl.dynamics.elimination.THRIFT", np.inf):
+        with patch("cirl_marl.dynamics.static_elimination.THRIFT", np.inf):
             eliminate(self, constant - kept)
 
     return patch.object(StaticElimination, "_eliminate", chosen)
@@ -130,6 +131,83 @@ def test_throughputs_past_detours_are_accurate(seed: int, passing: int, exponent
     assert routes is not None
     dynamics.routing.pass_on(flow, routes)
     np.testing.assert_allclose(network.throughput(flow)[:, 0], exact, rtol=1e-12)
+
+
+def crowds(least: int) -> Any:
+    """Return what lets as few nodes as ``least`` be a core, however few of them pass to each other."""
+    return patch.multiple("cirl_marl.dynamics.elimination", CORE=least, CROWDED=0.0)
+
+
+@given(seed=st.integers(0, 2**31), passing=st.integers(1, 25), least=st.integers(1, 12))
+@settings(max_examples=15)
+def test_a_core_is_passed_as_its_nodes_are_one_by_one(seed: int, passing: int, least: int) -> None:
+    """Inverted at once or eliminated in rounds, after rounds or without; two copies or each alone, to the bit."""
+    network = cycle(seed, 3, passing)
+    with crowds(least):
+        env = MultiAgentVectorEnv(network, num_envs=2)
+        kept = range(0, passing, 2)
+        ours = played(network, seed), played(network, seed, kept=kept)
+        lone = MultiAgentVectorEnv(network, num_envs=1)
+    for found, expected in zip(ours, (played(network, seed), played(network, seed, kept=kept)), strict=True):
+        for mine, theirs in zip(found, expected, strict=True):
+            np.testing.assert_allclose(mine, theirs, rtol=1e-13, atol=1e-13 * np.abs(theirs).max())
+    actions = np.random.default_rng(seed).uniform(-1, 1, (len(env.agents), 2))
+    env.reset(seed=[4, 5])
+    lone.reset(seed=[5])
+    np.testing.assert_array_equal(env.advance(actions).flow[:, 1:], lone.advance(actions[:, 1:]).flow)
+
+
+@given(seed=st.integers(0, 2**31), count=st.integers(1, 9), exponent=st.integers(1, 14))
+def test_visits_are_accurate_however_much_goes_round(seed: int, count: int, exponent: int) -> None:
+    """(I − P) V = I in fractions, where V is what several copies get together, and each alone, to the bit."""
+    rng = np.random.default_rng(seed)
+    shares = rng.random((3, count, count)) * (rng.random((3, count, count)) < 0.7)
+    shares[:, np.arange(count), np.arange(count)] = 0.0
+    exits = rng.random((3, count)) * 10.0**-exponent
+    found = visits(shares, exits)
+    np.testing.assert_array_equal(found[1:2], visits(shares[1:2].copy(), exits[1:2].copy()))
+    matrix = [[Fraction(-shares[0, i, j]) for j in range(count)] for i in range(count)]
+    for i in range(count):
+        matrix[i][i] = sum(map(Fraction, shares[0, i]), Fraction(exits[0, i]))
+        matrix[i] += [Fraction(int(i == j)) for j in range(count)]
+    for i in range(count):
+        for k in range(count):
+            if k != i:
+                factor = matrix[k][i] / matrix[i][i]
+                matrix[k] = [a - factor * b for a, b in zip(matrix[k], matrix[i], strict=True)]
+    exact = [[float(matrix[i][count + j] / matrix[i][i]) for j in range(count)] for i in range(count)]
+    np.testing.assert_allclose(found[0], exact, rtol=1e-12)
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("every", [0, 3])
+def test_markets_at_random_have_a_core(every: int) -> None:
+    """Hubs that pass to each other: batch = lone to the bit, and no mass is lost, whatever the agents do."""
+    network = market_network(600, every=every)
+    env, lone = MultiAgentVectorEnv(network, num_envs=2), MultiAgentVectorEnv(network, num_envs=1)
+    assert len(env.dynamics.routing.detours.elimination.core) >= 64 or every == 0
+    env.reset(seed=[4, 5])
+    lone.reset(seed=[5])
+    start = env.physical.stock.sum(axis=0)
+    for seed in range(3):
+        actions = np.random.default_rng(seed).uniform(-1, 1, (len(env.agents), 2))
+        outcome = env.advance(actions)
+        np.testing.assert_array_equal(outcome.flow[:, 1:], lone.advance(actions[:, 1:]).flow)
+        through = np.zeros((len(network.nodes), 2))
+        np.add.at(through, network.recipients, outcome.flow)
+        passing = slice(len(network.stores), None)
+        np.testing.assert_allclose(through[passing], network.throughput(outcome.flow), rtol=1e-12)
+    np.testing.assert_allclose(env.physical.stock.sum(axis=0), start, rtol=1e-12)
+
+
+@pytest.mark.medium
+def test_compiled_size_is_in_proportion_to_the_network() -> None:
+    """World markets that pass to every region are kept, so that the regions are not joined to each other."""
+    networks = [yearly_network(regions=regions) for regions in (30, 300)]
+    detours = [Dynamics(network).routing.detours for network in networks]
+    entries = [sum(map(len, found.out)) + found.elimination.size for found in detours]
+    arcs = [len(network.arcs) for network in networks]
+    assert entries[1] / arcs[1] <= 1.1 * entries[0] / arcs[0]
 
 
 @pytest.mark.parametrize("batch", [1, 2, 33])

@@ -1,15 +1,18 @@
-"""Elimination of nodes that store nothing, in numbers where shares never change, else in arrays over all copies.
+"""Elimination of nodes that store nothing, in arrays over all copies.
 
 The order is found once. Nodes that are not neighbours are eliminated in the same round, a handful of array operations
 over all of them and all copies, so a column's bits do not depend on the batch it is in. As the shares of a node sum to
 1, its pivot 1 − P_ii is the sum of its other shares (Grassmann, Taksar, Heyman 1985): nothing is ever subtracted.
+
+Where the nodes that remain pass to a good part of each other, as in random graphs of markets, they are a *core*: its
+shares are a full matrix, and its visits are found at once, by blocks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from functools import cached_property, lru_cache
-from heapq import heapify, heappop, heappush
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
+from itertools import chain
 from typing import Annotated
 
 import numpy as np
@@ -18,11 +21,20 @@ from cirl_marl.network import Floats, Integers, RowSum
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.rowsum import Triangle, kernels_round_products
 
-_Link = tuple[int, int, int]
-"""Place of a pivot in its round, then what gives and what gets."""
+_Ways = tuple[Integers, Integers]
+"""How many neighbours each pivot of a round has on one side, and these, pivot by pivot."""
 
 COSTLY = 2
 """A round eliminates nodes that are at most this many times as costly as the cheapest."""
+
+CORE, CROWDED = 64, 0.25
+"""Least number of nodes in a core, and least part of the pairs of them that have a share between them."""
+
+ROUND = 50
+"""What the calls of one round of ``EliminatedShares`` cost, in multiplications of as many copies as benchmarks have."""
+
+SERIES = 12
+"""Throughputs for each elimination: the usual number of terms of the solver's series."""
 
 
 @positional_record
@@ -45,124 +57,174 @@ class _Round:
 
 
 class EliminationOrder:
-    """A sparse order: in each round nodes that are no neighbours and make few detours.
+    """A sparse order: in each round nodes that are no neighbours and make few detours; then the core, if there is one.
 
     Attributes:
         nodes: number of nodes.
-        size: number of entries.
         pivots: the nodes that each round eliminates.
+        core: those that are left then.
+        cost: multiplications for every throughput, and what they share of those for every elimination, in each copy;
+            all of them, if it is not above ``most``.
     """
 
-    def __init__(self, nodes: int, pairs: Iterable[tuple[int, int]]) -> None:
-        """Take the shares as pairs of nodes (from, to); ``to`` is negative for what leaves the set."""
-        self._place: dict[tuple[int, int], int] = {}
-        self.nodes, self.size = nodes, nodes
-        self._gives: list[set[int]] = [set() for _ in range(nodes)]
-        self._gets: list[set[int]] = [set() for _ in range(nodes)]
-        for i, j in pairs:
-            self._join(i, j)
+    def __init__(self, gives: Sequence[set[int]], *, is_constant: bool = False, most: float = np.inf) -> None:
+        """Find the order, or give it up once it costs more than ``most``.
+
+        Args:
+            gives: the other nodes that each node passes to; used up.
+            is_constant: whether no share ever changes, so that a core is inverted once.
+            most: highest cost that is of interest.
+        """
+        self.nodes, self._gives = len(gives), gives
+        self._gets: list[set[int]] = [set() for _ in gives]
+        for i, ends in enumerate(gives):
+            for j in ends:
+                self._gets[j].add(i)
         self.pivots: list[list[int]] = []
-        self._links: list[tuple[list[_Link], list[_Link], list[tuple[int, int, int]]]] = []
-        candidates = set(range(nodes))
-        while candidates:
-            pivots = self._independent(candidates)
+        self.core: Integers = np.empty(0, dtype=np.intp)
+        self._ways: list[tuple[_Ways, _Ways]] = []
+        self.cost = 0.0
+        candidates, passes, detours = set(range(self.nodes)), 0, 0
+        while candidates and self.cost <= most:
+            costs = {i: len(gives[i]) * len(self._gets[i]) for i in candidates}
+            count = len(candidates)
+            if count >= CORE and sum(len(gives[i]) for i in candidates) >= CROWDED * count**2:
+                self.core = np.array(sorted(candidates), dtype=np.intp)
+                # one pass over memory; and as many additions as detours, but in blocks that stay in a cache
+                self.cost += count**2 + (0.0 if is_constant else count**3 / SERIES)
+                break
+            pivots = self._independent(costs)
             self.pivots.append(pivots)
-            self._links.append(self._eliminate(pivots))
+            self._ways.append((_ways_of(pivots, gives), _ways_of(pivots, self._gets)))
+            passes += sum(len(ends) for _, ends in self._ways[-1])
+            detours += self._eliminate(pivots)
+            # factors that differ from copy to copy are gathered, multiplied and added: three passes over memory
+            self.cost = 3 * passes + 4 * detours / SERIES + ROUND * len(self.pivots)
             candidates.difference_update(pivots)
 
     @property
-    def work(self) -> tuple[int, int]:
-        """Multiplications for every throughput, and for every elimination, in each copy."""
-        multiplications = sum(len(out) + len(into) for out, into, _ in self._links)
-        return multiplications, sum(len(detours) for _, _, detours in self._links)
+    def size(self) -> int:
+        """Number of entries: what leaves the set, then shares between two nodes, then the full matrix of the core."""
+        return self.nodes + len(self._keys) + len(self.core) ** 2
 
-    def entry(self, i: int, j: int) -> int:
-        """Return the entry of the share that i gives to j; the first ones are what leaves the set."""
-        return i if j < 0 else self._place[i, j]
+    def entries(self, givers: Integers, getters: Integers) -> Integers:
+        """Return the entries of the shares that nodes give to others, or to −1 where that leaves the set."""
+        places = np.full(self.nodes, -1, dtype=np.intp)
+        places[self.core] = np.arange(len(self.core))
+        row, column = places[givers], places[getters]
+        full = self.nodes + len(self._keys) + row * len(self.core) + column
+        sparse = self.nodes + np.searchsorted(self._keys, givers * self.nodes + getters)
+        between: Integers = np.where((row >= 0) & (column >= 0), full, sparse)
+        return np.where(getters < 0, givers, between)
 
-    def _join(self, i: int, j: int) -> int:
-        if j < 0:
-            return i
-        if (i, j) not in self._place:
-            self._place[i, j] = self.size
-            self.size += 1
-            self._gives[i].add(j)
-            self._gets[j].add(i)
-        return self._place[i, j]
+    def _pairs(self, side: int) -> _Ways:
+        """Return the pivots of all rounds, once for each neighbour on one side, and these neighbours."""
+        nothing = np.empty(0, dtype=np.intp)
+        counts, ends = zip((nothing, nothing), *(ways[side] for ways in self._ways), strict=True)
+        pivots = np.array([*chain(*self.pivots)], dtype=np.intp)
+        return np.repeat(pivots, np.concatenate(counts)), np.concatenate(ends)
 
-    def _independent(self, candidates: set[int]) -> list[int]:
-        cost = {i: len(self._gives[i]) * len(self._gets[i]) for i in candidates}
-        most = COSTLY * min(cost.values())
+    @cached_property
+    def _keys(self) -> Integers:
+        """Pairs with a share between them, but those within the core, as giver · nodes + getter, sorted."""
+        (givers, out), (getters, into) = self._pairs(0), self._pairs(1)
+        return np.sort(np.concatenate([givers * self.nodes + out, into * self.nodes + getters]))
+
+    def _independent(self, costs: Mapping[int, int]) -> list[int]:
+        most = COSTLY * min(costs.values())
         pivots: list[int] = []
         near: set[int] = set()
-        for i in sorted((i for i in candidates if cost[i] <= most), key=lambda i: (cost[i], i)):
+        for _, i in sorted((cost, i) for i, cost in costs.items() if cost <= most):
             if i not in near:
                 pivots.append(i)
                 near |= self._gives[i] | self._gets[i]
         return pivots
 
-    def _eliminate(self, pivots: list[int]) -> tuple[list[_Link], list[_Link], list[tuple[int, int, int]]]:
-        """Eliminate the nodes of a round: what they give, what they get, and each detour as way in, way out, entry."""
-        out = [(n, i, k) for n, i in enumerate(pivots) for k in sorted(self._gives[i])]
-        into = [(n, j, i) for n, i in enumerate(pivots) for j in sorted(self._gets[i])]
-        ways: list[list[tuple[int, int]]] = [[(len(out) + n, -1)] for n in range(len(pivots))]
-        for place, (n, _, k) in enumerate(out):
-            ways[n].append((place, k))
+    def _eliminate(self, pivots: Iterable[int]) -> int:
+        """Join the neighbours of a round, and return how many detours past its nodes there are."""
+        detours = 0
         for i in pivots:
-            for k in self._gives[i]:
-                self._gets[k].discard(i)
-            for j in self._gets[i]:
-                self._gives[j].discard(i)
-        join = self._join
-        detours = [
-            (way_in, way_out, join(j, k)) for way_in, (n, j, _) in enumerate(into) for way_out, k in ways[n] if k != j
-        ]
-        return out, into, detours
+            out, into = self._gives[i], self._gets[i]
+            detours += len(into) * (len(out) + 1) - len(into & out)
+            for nodes, ends, neighbours in ((into, out, self._gives), (out, into, self._gets)):
+                for j in nodes:
+                    neighbours[j] |= ends
+                    neighbours[j] -= {i, j}
+        return detours
 
     @cached_property
     def rounds(self) -> list[_Round]:
         """What each round does; only of the order that is chosen it has to be known."""
-        return [self._round_of(pivots, *links) for pivots, links in zip(self.pivots, self._links, strict=True)]
+        return [self._round_of(np.array(pivots), *ways) for pivots, ways in zip(self.pivots, self._ways, strict=True)]
 
     @cached_property
     def triangles(self) -> tuple[Integers, Triangle, Triangle]:
         """All rounds in one: the nodes as they are eliminated, what they give on, and what comes back, in reverse."""
-        nodes = np.array([i for pivots in self.pivots for i in pivots], dtype=np.intp)
+        nodes = np.concatenate([np.array([*chain(*self.pivots)], dtype=np.intp), self.core])
         place = np.argsort(nodes)
-        out, into = (
-            place[np.array([link[1:] for links in self._links for link in links[n]], dtype=np.intp).reshape(-1, 2)]
-            for n in (0, 1)
-        )
-        back = self.nodes - 1 - into
-        return nodes, Triangle(out[:, 1], out[:, 0], self.nodes), Triangle(back[:, 1], back[:, 0], self.nodes)
+        (givers, out), (getters, into) = (tuple(map(place.take, self._pairs(side))) for side in (0, 1))
+        back = self.nodes - 1
+        return nodes, Triangle(out, givers, self.nodes), Triangle(back - getters, back - into, self.nodes)
 
-    def _round_of(
-        self, pivots: list[int], out: list[_Link], into: list[_Link], detours: list[tuple[int, int, int]]
-    ) -> _Round:
-        givers, donors, receivers = np.array(out, dtype=np.intp).reshape(-1, 3).T.copy()
-        getters, sources, gets = np.array(into, dtype=np.intp).reshape(-1, 3).T.copy()
-        first, second, entries = np.array(detours, dtype=np.intp).reshape(-1, 3).T.copy()
+    def _round_of(self, nodes: Integers, out_ways: _Ways, into_ways: _Ways) -> _Round:
+        (out_counts, out), (into_counts, into) = out_ways, into_ways
+        giver, getter = np.repeat(np.arange(len(nodes)), out_counts), np.repeat(np.arange(len(nodes)), into_counts)
+        # each way in with each way out of its node, of which that out of the set comes first
+        counts = out_counts[getter] + 1
+        first = np.repeat(np.arange(len(into)), counts)
+        number = np.arange(len(first)) - np.repeat(np.cumsum(counts) - counts, counts)
+        begins = np.cumsum(out_counts) - out_counts
+        second = np.where(number > 0, begins[getter[first]] + number - 1, len(out) + getter[first])
+        ends = np.append(out, np.full(len(nodes), -1))[second]
+        is_detour = ends != into[first]  # what comes back to where it was is left out
+        first, second = first[is_detour], second[is_detour]
+        entries = self.entries(into[first], ends[is_detour])
         return _Round(
-            nodes=np.array(pivots, dtype=np.intp),
-            out=np.array([self._place[i, k] for _, i, k in out], dtype=np.intp),
-            giver=givers,
-            out_sum=RowSum(givers, range(len(out)), 1.0, (len(pivots), len(out))),
-            into=np.array([self._place[j, i] for _, j, i in into], dtype=np.intp),
-            getter=getters,
+            nodes=nodes,
+            out=self.entries(nodes[giver], out),
+            giver=giver,
+            out_sum=RowSum(giver, np.arange(len(out)), 1.0, (len(nodes), len(out))),
+            into=self.entries(into, nodes[getter]),
+            getter=getter,
             first=first,
             second=second,
-            detours=RowSum(entries, range(len(entries)), 1.0, (self.size, len(entries))),
-            forward=RowSum(receivers, range(len(out)), 1.0, (self.nodes, len(out))),
-            donors=donors,
-            backward=RowSum(gets, range(len(into)), 1.0, (self.nodes, len(into))),
-            sources=sources,
+            detours=RowSum(entries, np.arange(len(entries)), 1.0, (self.size, len(entries))),
+            forward=RowSum(out, np.arange(len(out)), 1.0, (self.nodes, len(out))),
+            donors=nodes[giver],
+            backward=RowSum(nodes[getter], np.arange(len(into)), 1.0, (self.nodes, len(into))),
+            sources=into,
         )
 
 
-@lru_cache(maxsize=16)  # scenarios of a network often differ in nothing that matters here
-def elimination_order(nodes: int, pairs: tuple[tuple[int, int], ...]) -> EliminationOrder:
-    """Return the order for the same nodes and pairs, found once."""
-    return EliminationOrder(nodes, pairs)
+def _ways_of(pivots: Sequence[int], neighbours: Sequence[set[int]]) -> _Ways:
+    ends = [sorted(neighbours[i]) for i in pivots]
+    return np.array([*map(len, ends)], dtype=np.intp), np.array([*chain(*ends)], dtype=np.intp)
+
+
+def visits(shares: Floats, exits: Floats) -> Floats:
+    """Return how often what enters each node passes through each, (I − P)⁻¹, without a subtraction, shape (…, n, n).
+
+    One half of the nodes is eliminated from the other, by blocks. All copies go through the same products, each alone,
+    so that their bits do not depend on their number.
+
+    Args:
+        shares: P, shape (…, n, n), whose diagonal is not read: a node passes on what comes back to it at once.
+        exits: what leaves the nodes altogether, 1 − Σ_j P_ij but for P_ii, shape (…, n).
+    """
+    count = exits.shape[-1]
+    if count == 1:
+        return 1.0 / exits[..., None]
+    early, late = slice(0, count // 2), slice(count // 2, count)
+    on, back = shares[..., early, late], shares[..., late, early]
+    result: Floats = np.empty(shares.shape)
+    among = visits(shares[..., early, early], exits[..., early] + on.sum(axis=-1))
+    on, back_among = among @ on, back @ among
+    further = exits[..., late] + (back_among @ exits[..., early, None])[..., 0]
+    result[..., late, late] = rest = visits(shares[..., late, late] + back @ on, further)
+    result[..., early, late] = on = on @ rest
+    result[..., late, early] = rest @ back_among
+    result[..., early, early] = among + on @ back_among
+    return result
 
 
 class EliminatedShares:
@@ -171,7 +233,7 @@ class EliminatedShares:
     def __init__(self, order: EliminationOrder, values: Floats) -> None:
         """Eliminate ``values``, shape (entries, B or 1): of each node what leaves the set, then the shares."""
         self._steps = []
-        self._inverse = np.empty((order.nodes, values.shape[1]))
+        self._inverse = np.ones((order.nodes, values.shape[1]))
         for round_ in order.rounds:
             out, into, exits = values.take(round_.out, 0), values.take(round_.into, 0), values.take(round_.nodes, 0)
             # the pivot 1 − P_ii as the sum of what goes elsewhere, so that nothing cancels
@@ -184,7 +246,10 @@ class EliminatedShares:
             into *= inverse.take(round_.getter, 0)
             self._inverse[round_.nodes] = inverse
             self._steps.append((round_, out, into))
-        self._order = order
+        self._order, core = order, order.core
+        if len(core):
+            shares = np.ascontiguousarray(values[order.size - len(core) ** 2 :].T)
+            self._visits = visits(shares.reshape(-1, len(core), len(core)), np.ascontiguousarray(values[core].T))
 
     @cached_property
     def _numbers(self) -> tuple[Floats, Floats, Floats]:
@@ -194,9 +259,15 @@ class EliminatedShares:
         into = np.concatenate([part[:, 0] for _, _, part in self._steps])
         return ahead.arrange(out), self._inverse[nodes, 0], back.arrange(into)
 
+    def _pass_core(self, values: Floats) -> Floats:
+        """Return what passes through the core for what enters it, shape (nodes of the core, B)."""
+        result: Floats = (np.ascontiguousarray(values.T)[:, None] @ self._visits)[:, 0].T
+        return result
+
     def throughput(self, inflow: Floats) -> Floats:
         """Return q in place of what enters from elsewhere, shape (nodes, B)."""
         # forward substitution in the order of elimination, then backward: (I − Pᵀ)⁻¹ = L⁻¹ D⁻¹ U⁻¹
+        core = self._order.core
         if inflow.shape[1] == 1 and self._steps and kernels_round_products():
             # of one copy each sum is that of many, but in two calls; a round takes longer to call than to compute
             nodes, ahead, back = self._order.triangles
@@ -204,6 +275,8 @@ class EliminatedShares:
             values = inflow[nodes, 0]
             ahead.substitute(out, values)
             values *= inverse
+            if len(core):
+                values[-len(core) :] = self._pass_core(values[-len(core) :, None])[:, 0]
             values = values[::-1].copy()
             back.substitute(into, values)
             inflow[nodes, 0] = values[::-1]
@@ -211,165 +284,8 @@ class EliminatedShares:
         for round_, out, _ in self._steps:
             round_.forward.add_to(inflow, inflow.take(round_.donors, 0) * out)
         inflow *= self._inverse
+        if len(core):
+            inflow[core] = self._pass_core(inflow[core])
         for round_, _, into in reversed(self._steps):
             round_.backward.add_to(inflow, inflow.take(round_.sources, 0) * into)
         return inflow
-
-
-SparseRow = dict[int, float]
-"""End → part of what a node passes on. Node j is end j, stock s is end nodes + s."""
-
-THRIFT = 4
-"""Where the next constant node costs so many times as much as any before, stopping there is considered."""
-
-ROUND = 50
-"""What the calls of one round of ``EliminatedShares`` cost, in multiplications of as many copies as benchmarks have."""
-
-SERIES = 12
-"""Throughputs for each elimination: the usual number of terms of the solver's series."""
-
-
-class StaticElimination:
-    """The nodes whose shares never change, eliminated once in Python numbers, and the nodes that are kept.
-
-    What enters such a node ends up, in fixed parts, in stocks and in nodes whose shares do change.
-
-    Attributes:
-        order: the eliminated nodes, in their order.
-        kept: the others. Constant ones are among them where eliminating them would join too many others.
-        inverse: 1/pivot of each of ``order``.
-        out: parts in which each of ``order`` passes on what it has got when its turn comes, to later ones, ends.
-        into: parts of the throughputs of later ones of ``order`` that come back to each of ``order``.
-        elimination: order of elimination of the kept nodes, by their place in ``kept``.
-    """
-
-    def __init__(self, nodes: int, constant: Iterable[int], gives: Mapping[int, SparseRow]) -> None:
-        """Eliminate ``constant`` of so many nodes; of the others the ends that each ``gives`` to matter, not how much.
-
-        Args:
-            nodes: number of nodes that store nothing.
-            constant: those whose shares never change.
-            gives: shares of every node.
-        """
-        self._nodes = nodes
-        self._gives = {i: dict(gives[i]) for i in range(nodes)}
-        self._gets: dict[int, set[int]] = {i: set() for i in range(nodes)}
-        for i, parts in self._gives.items():
-            for j in parts:
-                if j < nodes:
-                    self._gets[j].add(i)
-        self.order: list[int] = []
-        self.inverse: list[float] = []
-        self.out: list[SparseRow] = []
-        self.into: list[SparseRow] = []
-        self._eliminate(set(constant))
-
-    def reach(self) -> dict[int, SparseRow]:
-        """Return in which parts what enters each of ``order`` gets to kept nodes, and past them, end −1."""
-        rows: dict[int, SparseRow] = {}
-        for i, out in zip(reversed(self.order), reversed(self.out), strict=True):
-            row: SparseRow = {}
-            for end, part in out.items():
-                for j, further in rows.get(end, {end if end < self._nodes else -1: 1.0}).items():
-                    row[j] = row.get(j, 0.0) + part * further
-            rows[i] = row
-        return rows
-
-    def _eliminate(self, constant: set[int]) -> None:
-        """Eliminate all constant nodes, the cheapest first, then take back those that were better kept."""
-        queue = [(self._cost(i), i) for i in constant]
-        heapify(queue)
-        most = entries = 0
-        ways: list[tuple[float, int, list[int], EliminationOrder]] = []
-        while queue:
-            cost, i = heappop(queue)
-            if i not in constant or cost != self._cost(i):
-                continue  # out of date: it stands in the queue again
-            if cost > THRIFT * most:
-                ways.append(self._way(entries))
-            most = max(most, cost)
-            near = self._without(i)
-            constant.remove(i)
-            entries += len(self.out[-1])
-            for j in near & constant:
-                heappush(queue, (self._cost(j), j))
-        ways.append(self._way(entries))
-        _, count, self.kept_nodes, self.elimination = min(ways, key=lambda way: way[:2])
-        for sequence in (self.order, self.inverse, self.out, self.into):
-            del sequence[count:]
-        early = set(self.order)
-        self.into = [{j: part for j, part in into.items() if j in early} for into in self.into]
-
-    def _cost(self, i: int) -> int:
-        return len(self._gets[i]) * len(self._gives[i])
-
-    def _way(self, entries: int) -> tuple[float, int, list[int], EliminationOrder]:
-        """Return what it costs to stop here, how many are eliminated then, who is kept, and in which order."""
-        kept_nodes = sorted(self._gives)
-        place = {i: n for n, i in enumerate(kept_nodes)}
-        pairs = ((place[i], place[j]) for i in kept_nodes for j in self._gives[i] if j in place and j != i)
-        order = elimination_order(len(kept_nodes), tuple(pairs))
-        pass_cost, build_cost = order.work
-        # factors that differ from copy to copy are gathered, multiplied and added: three passes over memory, not one
-        cost = 2 * entries + 3 * pass_cost + 4 * build_cost / SERIES + ROUND * len(order.pivots)
-        return cost, len(self.order), kept_nodes, order
-
-    def _without(self, i: int) -> set[int]:
-        """Eliminate node i and return its neighbours."""
-        out, sources = self._gives.pop(i), self._gets.pop(i)
-        # P_jk gains P_ji·P_ik/(Σ_k P_ik), the Kron reduction of node i
-        inverse = 1.0 / sum(out.values())
-        parts = {end: share * inverse for end, share in out.items()}
-        into: SparseRow = {}
-        for j in sources:
-            share_ = self._gives[j].pop(i)
-            into[j] = share_ * inverse
-            for end, part in parts.items():
-                if end != j:  # what comes back to j is left out, and its pivot is the sum of the rest
-                    self._gives[j][end] = self._gives[j].get(end, 0.0) + share_ * part
-                    if end < self._nodes:
-                        self._gets[end].add(j)
-        near = {end for end in out if end < self._nodes}
-        for end in near:
-            self._gets[end].discard(i)
-        self.order.append(i)
-        self.inverse.append(inverse)
-        self.out.append(parts)
-        self.into.append(into)
-        return near | sources
-
-
-def contract_hubs(gives: dict[int, SparseRow], hubs: Iterable[int]) -> list[int]:
-    """Take hubs out of an acyclic graph, in place, where the ways past them are no more than the ways to and from them.
-
-    Args:
-        gives: parts in which each source or hub passes on what it has.
-        hubs: in an order in which each passes on to later ones only.
-
-    Returns:
-        the hubs that are left, in their order.
-    """
-    hubs = [hub for hub in hubs if hub in gives]
-    gets: dict[int, set[int]] = {hub: set() for hub in hubs}
-    for i, parts in gives.items():
-        for j in parts.keys() & gets.keys():
-            gets[j].add(i)
-    for hub in hubs:
-        sources, parts = gets[hub], gives[hub]
-        if len(sources) * len(parts) > len(sources) + len(parts):
-            continue
-        for i in sources:
-            share = gives[i].pop(hub)
-            for j, part in parts.items():
-                gives[i][j] = gives[i].get(j, 0.0) + share * part
-        for j in parts.keys() & gets.keys():
-            gets[j].discard(hub)
-            gets[j] |= sources
-        del gives[hub], gets[hub]
-    return [hub for hub in hubs if hub in gets]
-
-
-def square_matrix(gives: Mapping[int, SparseRow], row: Mapping[int, int], size: int) -> RowSum:
-    """Return the square matrix of the parts whose source and end have a ``row``; the others are left out."""
-    ways = [(row[j], row[i], part) for i, parts in gives.items() if i in row for j, part in parts.items() if j in row]
-    return RowSum([i for i, _, _ in ways], [j for _, j, _ in ways], [part for _, _, part in ways], (size, size))

@@ -16,7 +16,8 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.dynamics.elimination import EliminatedShares, SparseRow, StaticElimination, square_matrix
+from cirl_marl.dynamics.elimination import EliminatedShares
+from cirl_marl.dynamics.static_elimination import SparseRow, StaticElimination, square_matrix
 from cirl_marl.dynamics.visit_bounds import VisitBounds
 from cirl_marl.network import Floats, Integers, Network, RowSum
 from cirl_marl.network.declarations import positional_record
@@ -107,24 +108,21 @@ class Routing:
         """Write the shares between kept nodes as weighted sums of the shares of arcs."""
         detours, order = self.detours, self.detours.elimination
         place, reach = {i: n for n, i in enumerate(detours.kept_nodes)}, detours.reach()
-        fixed_terms: list[tuple[int, int, float]] = []
-        varying_terms: list[tuple[int, int, float]] = []
+        fixed_terms: list[tuple[int, int, int, float]] = []
+        varying_terms: list[tuple[int, int, int, float]] = []
         for k, (i, end) in enumerate(zip(self.donors.tolist(), self.ends.tolist(), strict=True)):
             if i in place and (shares[k] > 0 or not self.is_fixed[k]):
-                for j, part in reach.get(end, {end if end < self.nodes else -1: 1.0}).items():
-                    if j != i:
-                        entry = order.entry(place[i], place.get(j, -1))
-                        (fixed_terms if self.is_fixed[k] else varying_terms).append((entry, k, part))
-        products = [part * shares[k] for _, k, part in fixed_terms]
-        self._fixed_entries = np.bincount([entry for entry, _, _ in fixed_terms], products, order.size).astype(float)[
-            :, None
-        ]
-        self._varying_arcs = np.array(sorted({k for _, k, _ in varying_terms}), dtype=np.intp)
-        columns = np.searchsorted(self._varying_arcs, [k for _, k, _ in varying_terms])
-        weights = [part for _, _, part in varying_terms]
-        self._entries = RowSum(
-            [entry for entry, _, _ in varying_terms], columns, weights, (order.size, len(self._varying_arcs))
-        )
+                terms = fixed_terms if self.is_fixed[k] else varying_terms
+                parts = reach.get(end, {end if end < self.nodes else -1: 1.0})
+                terms += [(k, place[i], place.get(j, -1), part) for j, part in parts.items() if j != i]
+        fixed_table, varying_table = (np.array(terms).reshape(-1, 4) for terms in (fixed_terms, varying_terms))
+        arcs, givers, getters = fixed_table[:, :3].T.astype(np.intp)
+        products = fixed_table[:, 3] * shares[arcs]
+        self._fixed_entries = np.bincount(order.entries(givers, getters), products, order.size).astype(float)[:, None]
+        arcs, givers, getters = varying_table[:, :3].T.astype(np.intp)
+        self._varying_arcs, columns = np.unique(arcs, return_inverse=True)
+        shape = (order.size, len(self._varying_arcs))
+        self._entries = RowSum(order.entries(givers, getters), columns, varying_table[:, 3], shape)
 
     def routes(self, rate: Floats) -> IntervalRoutes | None:
         """Return what to pass flows on with while ``rate``, shape (arcs, B), holds; None if every node stores."""

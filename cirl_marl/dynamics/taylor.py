@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cirl_marl.dynamics.elimination import SparseRow, contract_hubs, square_matrix
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.dynamics.routing import IntervalRoutes, Routing
+from cirl_marl.dynamics.static_elimination import SparseRow, contract_hubs, square_matrix
 from cirl_marl.network import Floats, Integers, RowSum
 from cirl_marl.network.elements import Law
 from cirl_marl.network.rowsum import spans
