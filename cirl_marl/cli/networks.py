@@ -48,8 +48,6 @@ def new(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="The definition to write, such as my.toml.")],
     material: Annotated[str, typer.Option(prompt="Which material", help="What flows.")],
     mass: Annotated[str, typer.Option(prompt="Unit of mass (such as t, kt, Mt)", help="Unit of mass.")],
-    in_use: Annotated[float, typer.Option(prompt="How much of it is in use", help="Mass in use at the start.")],
-    lifetime: Annotated[float, typer.Option(prompt="How many years it stays in use", help="Mean lifetime in years.")],
     recycled_share: Annotated[
         float,
         typer.Option(
@@ -59,6 +57,12 @@ def new(
     growth: Annotated[float, typer.Option(help="Growth of what is in use, percent a year.")] = 0.0,
     start: Annotated[int, typer.Option(help="First year.")] = 2025,
     years: Annotated[int, typer.Option(help="How many years the episode lasts.")] = 25,
+    in_use: Annotated[float | None, typer.Option(help="Mass in use at the start.")] = None,
+    lifetime: Annotated[float | None, typer.Option(help="Mean lifetime in years.")] = None,
+    product: Annotated[
+        list[str] | None,
+        typer.Option(help="NAME=IN_USE,LIFETIME of a product with a demand of its own, in place of both; repeated."),
+    ] = None,
 ) -> None:
     """Write a first network of your own: a material that is made, used for years, discarded, and recycled in part.
 
@@ -66,9 +70,35 @@ def new(
     """
     from cirl_marl.definitions.template import FirstCycle, write_first
 
-    answers = {"material": material, "mass": mass, "in_use": in_use, "lifetime": lifetime, "recycled": recycled_share}
-    write_first(FirstCycle(**answers, growth=growth, start=start, years=years), file)  # type: ignore[arg-type]
+    products = dict(_product(text) for text in product or ())
+    if products and (in_use, lifetime) != (None, None):
+        raise CirlError("--product says how much is in use and how long; leave out --in-use and --lifetime")
+    if not products:
+        in_use = typer.prompt("How much of it is in use", type=float) if in_use is None else in_use
+        lifetime = typer.prompt("How many years it stays in use", type=float) if lifetime is None else lifetime
+    first = FirstCycle(
+        material=material,
+        mass=mass,
+        in_use=1.0 if in_use is None else in_use,
+        lifetime=1.0 if lifetime is None else lifetime,
+        recycled=recycled_share,
+        growth=growth,
+        start=start,
+        years=years,
+        products=products,
+    )
+    write_first(first, file)
     say(f"wrote {file}; next: cirl plan {file} --control optimum --min-service 1, and cirl train {file}")
+
+
+def _product(text: str) -> tuple[str, tuple[float, float]]:
+    """Return name, mass in use and lifetime of a product, as ``--product`` gives them."""
+    name, _, numbers = text.partition("=")
+    try:
+        in_use, lifetime = (float(number) for number in numbers.split(","))
+    except ValueError:
+        raise CirlError(f"--product {text}: needs a name and two numbers, as in cars=120,14") from None
+    return name.strip(), (in_use, lifetime)
 
 
 @app.command(rich_help_panel=NETWORKS)

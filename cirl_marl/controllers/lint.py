@@ -9,7 +9,7 @@ from functools import cache, partial
 import numpy as np
 
 from cirl_marl.controllers.basic import Constant, Controller, Neutral
-from cirl_marl.controllers.outcome import service_shortages, shortages
+from cirl_marl.controllers.outcome import NOTABLE, service_shortages, shortages
 from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
 from cirl_marl.dynamics.laws import LAWS
 from cirl_marl.environments.vector import MultiAgentVectorEnv
@@ -21,6 +21,7 @@ from cirl_marl.network.lifetimes import CLOSE
 from cirl_marl.network.series import Series, extremes
 from cirl_marl.network.units import factor
 from cirl_marl.network.validation.settings import is_whole
+from cirl_marl.network.validation.stocks import OWN_DEMANDS
 
 COARSE = 0.01
 """Share of its largest value by which a state may depend on the step of the solver."""
@@ -38,7 +39,7 @@ def lint_warnings(network: Network, env: MultiAgentVectorEnv | None = None) -> I
     ``env`` is one copy of it; None makes one.
     """
     env = MultiAgentVectorEnv(network, num_envs=1) if env is None else env
-    for look in (_apart, _without_effect, _shares, _departures, _free):
+    for look in (_apart, _without_effect, _shares, _departures, _free, _markets):
         yield from look(network)
     neutral = cache(partial(_episode, env, Neutral()))
     yield from _short_flows(env, neutral)
@@ -179,6 +180,17 @@ def _free(network: Network) -> Iterator[str]:
             yield f"node '{node.id}': nothing enters it, and what it delivers counts nothing in λ; {remedy}"
 
 
+def _markets(network: Network) -> Iterator[str]:
+    """Yield stores that stand where a market would, so that each of several products gets what it asks for."""
+    recipients = {arc.recipient for arc in network.arcs}
+    for node in network.stores:
+        exits = [arc for arc in network.arcs if arc.donor == node.id]
+        orders = [arc for arc in exits if arc.law is Law.CONTROLLED]
+        if node.role is Role.TECHNOSPHERE and node.id in recipients and orders == exits and len(exits) > 1:
+            reason = f"a stock from which {', '.join(arc.id for arc in exits)} take what they ask for"
+            yield f"node '{node.id}': {reason}; if it is a market: stores = false, and {OWN_DEMANDS}"
+
+
 def _short_flows(env: MultiAgentVectorEnv, neutral: Callable[[], Rollout]) -> Iterator[str]:
     """Yield scheduled flows that run short: under neutral control, and from sources whose controls are at the highest.
 
@@ -218,6 +230,13 @@ def _short_services(env: MultiAgentVectorEnv, neutral: Callable[[], Rollout]) ->
         return
     for shortage in service_shortages(neutral(), env.network):
         yield f"under neutral control {shortage}; widen the bounds of its control, or ask for less"
+    supplied = {arc.makes_up_for for arc in env.network.arcs}
+    for service, level in zip(env.network.services, neutral().episode_levels[0].tolist(), strict=True):
+        if service.id not in supplied and level < 1 - NOTABLE:
+            lacks = (
+                f"service '{service.id}': under neutral control its level is {level:.3f}, and nothing makes up for it"
+            )
+            yield f"{lacks}, as for others. If a market shares out to several: {OWN_DEMANDS}"
 
 
 def _episode(env: MultiAgentVectorEnv, controller: Controller) -> Rollout:

@@ -1,19 +1,29 @@
-"""A first definition, from five numbers: a material that is made, used for years, discarded, and recycled in part."""
+"""A first definition, from five numbers: a material that is made, used for years, discarded, and recycled in part.
+
+Several products have demands of their own: what is recycled is shared out to them, and behind that market the deposit
+delivers to each what it lacks (docs/yearly_networks.md).
+"""
 
 from __future__ import annotations
 
 import re
 import sys
 import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError
 from cirl_marl.network.declarations import frozen_record
+from cirl_marl.network.elements import IDENTIFIER
 from cirl_marl.records.files import write_atomically
 
 TEMPLATE = Path(__file__).with_name("first_cycle.template")
+
+
+MARK = "%%\n"
 
 
 @frozen_record
@@ -28,12 +38,22 @@ class FirstCycle:
     growth: Annotated[float, "of what is in use, in percent a year"] = 0.0
     start: Annotated[int, "first year"] = 2025
     years: Annotated[int, "that the episode lasts"] = 25
+    products: Annotated[
+        Mapping[str, tuple[float, float]], "mass in use and mean lifetime of each, by id; empty for one without a name"
+    ] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Raise a ``CirlError`` for numbers that cannot be meant."""
         for name, (low, high, demand) in BOUNDS.items():
             if not low <= getattr(self, name) <= high:
                 raise CirlError(f"{name.replace('_', '-')} {getattr(self, name)}: {demand}")
+        for name, numbers in self.products.items():
+            if not re.fullmatch(IDENTIFIER, name):
+                raise CirlError(f"product '{name}': begins with a letter and has lower-case letters, digits and _ only")
+            for key, number in zip(("in_use", "lifetime"), numbers, strict=True):
+                low, high, demand = BOUNDS[key]
+                if not low <= number <= high:
+                    raise CirlError(f"product '{name}': {key.replace('_', '-')} {number}: {demand}")
         if not re.sub(r"\W", "", self.material) or any(mark in self.material for mark in '"\\\n{}'):
             raise CirlError(f"material {self.material!r}: needs letters, without quotes and braces")
         if any(mark in self.mass for mark in '"\\\n'):
@@ -70,28 +90,68 @@ def write_first(cycle: FirstCycle, path: Path) -> None:
 
 
 def _text(cycle: FirstCycle, path: Path) -> str:
+    """Return the definition; between marks in the template stands what there is of each product."""
+    end, products = cycle.start + cycle.years, list(_products(cycle))
+    common: dict[str, Any] = {
+        "title": f"{cycle.material[:1].upper()}{cycle.material[1:]}, {cycle.start} to {end}",
+        "file": path.name,
+        "name": re.sub(r"\W+", "_", path.stem).strip("_") or "network",
+        "material": cycle.material,
+        "mass": cycle.mass,
+        "growth": cycle.growth,
+        "in_use": sum(product["in_use"] for product in products),
+        "flow": sum(product["flow"] for product in products),
+        "start": cycle.start,
+        "end": end,
+        "years": cycle.years,
+        "recycled": cycle.recycled,
+        "recycled_to": "market" if cycle.products else "production",
+        "best": max(cycle.recycled, 0.9),
+    }
+    parts = TEMPLATE.read_text(encoding="utf-8").split(MARK)
+    text = "".join(
+        "".join(part.format(**common | product) for product in products) if place % 2 else part.format(**common)
+        for place, part in enumerate(parts)
+    )
+    return (text + _market(products, common["flow"]) if cycle.products else text).rstrip("\n") + "\n"
+
+
+def _products(cycle: FirstCycle) -> Iterator[dict[str, Any]]:
+    """Yield what the template says of each product."""
     end = cycle.start + cycle.years
     times = sorted({*range(cycle.start, end, 5), end})
-    flow = cycle.in_use / cycle.lifetime
     half_year = (1 + cycle.growth / 100) ** 0.5  # a year's demand is met by what is in use when it ends
-    values = [cycle.in_use * half_year * (1 + cycle.growth / 100) ** (year - cycle.start) for year in times]
-    return TEMPLATE.read_text(encoding="utf-8").format(
-        title=f"{cycle.material[:1].upper()}{cycle.material[1:]}, {cycle.start} to {end}",
-        file=path.name,
-        name=re.sub(r"\W+", "_", path.stem).strip("_") or "network",
-        material=cycle.material,
-        mass=cycle.mass,
-        in_use=cycle.in_use,
-        lifetime=cycle.lifetime,
-        deviation=0.3 * cycle.lifetime,
-        growth=cycle.growth,
-        flow=flow,
-        most=10 * flow,
-        start=cycle.start,
-        end=end,
-        years=cycle.years,
-        recycled=cycle.recycled,
-        best=max(cycle.recycled, 0.9),
-        times=times,
-        values=[float(f"{value:.6g}") for value in values],
+    for name, (in_use, lifetime) in (cycle.products or {"": (cycle.in_use, cycle.lifetime)}).items():
+        words = name.replace("_", " ")
+        values = [in_use * half_year * (1 + cycle.growth / 100) ** (year - cycle.start) for year in times]
+        yield {
+            "suffix": f"_{name}" if name else "",
+            "of": f": {words}" if name else "",
+            "label": words.capitalize() or "In use",
+            "in_use": in_use,
+            "lifetime": lifetime,
+            "deviation": 0.3 * lifetime,
+            "flow": in_use / lifetime,
+            "most": 10 * in_use / lifetime,
+            "times": times,
+            "values": [float(f"{value:.6g}") for value in values],
+        }
+
+
+def _market(products: list[dict[str, Any]], flow: float) -> str:
+    """Return the market that shares out what is recycled, in proportion to what goes into each use."""
+    shares = [
+        f'{{ value = {product["flow"] / flow:.6g}, unit = "1", source = "part of what goes into use" }}'
+        for product in products
+    ]
+    shares[-1] = '"rest"'
+    market = (
+        '[nodes.market]                # shares out what is recycled; extraction makes up behind it\ntitle = "Market"\n'
     )
+    market += 'role = "technosphere"\nstores = false\n'
+    for product, share in zip(products, shares, strict=True):
+        suffix = product["suffix"]
+        market += (
+            f'\n[arcs.recycled{suffix}]\nfrom = "market"\nto = "production{suffix}"\nlaw = "share"\nshare = {share}\n'
+        )
+    return market

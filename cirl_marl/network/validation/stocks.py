@@ -23,6 +23,10 @@ from cirl_marl.network.series import Series, extremes
 from cirl_marl.network.specification import Specification
 from cirl_marl.network.validation.settings import is_whole
 
+OWN_DEMANDS = (
+    "for products with demands of their own let it share out what is recycled, and primary material enter behind it, "
+    "by an arc for each that makes up for its service (docs/yearly_networks.md)"
+)
 NARROWEST, WIDEST = 0.02, 3.0
 """Deviations of a lifetime, relative to its mean, that stages follow at all."""
 
@@ -58,7 +62,8 @@ def storage_problems(node: Node, outflows: Sequence[Arc]) -> Iterator[str]:
     for arc in outflows:
         if arc.law is not Law.SHARE:
             reason = f"its donor '{node.id}' stores nothing, so that only law 'share' can leave it"
-            yield f"arc '{arc.id}': law '{arc.law}': {reason}"
+            remedy = f"; {OWN_DEMANDS}" if arc.law is Law.CONTROLLED else ""
+            yield f"arc '{arc.id}': law '{arc.law}': {reason}{remedy}"
 
 
 def series_problems(network: Specification) -> Iterator[str]:
