@@ -212,6 +212,24 @@ def test_stocks_are_where_a_store_begins(tmp_path: Path) -> None:
         import_flows(flows, tmp_path / "few.toml", stocks, roles=ROLES)
 
 
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        (
+            "Dumps",
+            "--store Dumps: in the table nothing leaves it, so that it is a sink.*--landfill, --incinerator, --env",
+        ),
+        ("Ore body", "--store Ore body: in the table nothing enters it, so that it is a source.*with --reservoir"),
+    ],
+)
+def test_a_sink_or_source_is_no_store(name: str, said: str, tmp_path: Path) -> None:
+    """It says why, and what to say instead; a pattern that fits them among others is about the others."""
+    flows = table(tmp_path / "flows.csv", cycle())
+    with pytest.raises(CirlError, match=said):
+        import_flows(flows, tmp_path / "metal.toml", roles=ROLES, stores=[name])
+    assert import_flows(flows, tmp_path / "metal.toml", roles=ROLES, stores=["U*", "Dump*"]).largest_error < 1e-9
+
+
 def noisy(rows: Sequence[Row], seed: int) -> list[list[object]]:
     """Return flows with errors of some percent, and how uncertain each is."""
     rng = np.random.default_rng(seed)
@@ -440,6 +458,8 @@ def test_how_plausible_an_adjustment_is(tmp_path: Path, capsys: pytest.CaptureFi
         app([*words, "--reservoir", "Ore", "--outside", "Use"], standalone_mode=False)
         said = capsys.readouterr().out
         assert "with 1 degrees of freedom" in said and "from the adjusted table" in said
+        largest = max(abs(change.after - change.before) for change in found.changes)
+        assert f"which is up to {largest:.2g} t/year from the original" in said
         assert ("warning: flows contradict each other" in said) is warned
 
 

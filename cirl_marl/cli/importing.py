@@ -92,7 +92,10 @@ def import_(
         _say_plausibility(report.reconciliation)
     for name, apart in report.stock_mistakes.items():
         say(f"stocks of '{name}': their growth and the flows are up to {apart:g} {table.unit} apart")
-    which = "the table" if report.reconciliation is None else "the adjusted table"
+    which = "the table"
+    if report.reconciliation is not None:
+        moved = max((abs(change.after - change.before) for change in report.changes), default=0.0)
+        which = f"the adjusted table, which is up to {moved:.2g} {table.unit} from the original"
     say(f"simulated without agents, no flow is further than {report.largest_error:.2g} {table.unit} from {which}")
     say(f"wrote {', '.join(map(str, report.files))}")
 

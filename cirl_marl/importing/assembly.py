@@ -95,6 +95,7 @@ def import_flows(
         table = table.of(regions)
     known_stocks = {} if stocks is None else read_stocks(stocks, table.unit.rpartition("/")[0])
     processes = Processes(table, _matching_processes(table, [*stores, *_stock_processes(table, known_stocks)], "store"))
+    _check_stores(processes, stores)
     reconciliation: Reconciliation | None = None
     if residuals := processes.residuals:
         if not reconcile:
@@ -123,6 +124,19 @@ def import_flows(
     return ImportReport(
         table, processes, role_of, reconciliation, mistakes, error, tuple(out.parent / file for file in files)
     )
+
+
+def _check_stores(processes: Processes, names: Sequence[str]) -> None:
+    """Raise a ``CirlError`` for a process that is named as a store though the table makes it a source or a sink."""
+    for name in names:
+        kind = processes.kinds.get(name)
+        if kind in (ProcessKind.SOURCE, ProcessKind.SINK):
+            reason = "nothing enters it, so that it is a source" if kind is ProcessKind.SOURCE else "nothing leaves it"
+            if kind is ProcessKind.SINK:
+                reason += ", so that it is a sink, whose stock is what has entered"
+            options = "--reservoir, --environment or --outside"
+            options = options if kind is ProcessKind.SOURCE else f"--landfill, --incinerator, {options[13:]}"
+            raise CirlError(f"--store {name}: in the table {reason}; say what it is with {options}")
 
 
 def _matching_processes(table: FlowTable, patterns: Sequence[str], label: str) -> list[str]:
