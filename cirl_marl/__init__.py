@@ -52,6 +52,8 @@ if TYPE_CHECKING:
     from cirl_marl.evaluation.assessment import evaluate as evaluate
     from cirl_marl.evaluation.comparison import Comparison as Comparison
     from cirl_marl.evaluation.comparison import compare as compare
+    from cirl_marl.evaluation.levers import Levers as Levers
+    from cirl_marl.evaluation.levers import levers as levers
     from cirl_marl.evaluation.pareto import ParetoFront as ParetoFront
     from cirl_marl.evaluation.pareto import pareto_front as pareto_front
     from cirl_marl.evaluation.plans import plan as plan
@@ -121,6 +123,7 @@ _MODULES = {
     "errors": "CirlError ControlError DefinitionError LearnerError NetworkError RecipeError RunError",
     "evaluation.assessment": "Evaluation evaluate",
     "evaluation.comparison": "Comparison compare",
+    "evaluation.levers": "Levers levers",
     "evaluation.pareto": "ParetoFront pareto_front",
     "evaluation.plans": "plan",
     "evaluation.simulations": "Simulation simulate simulate_alternatives",

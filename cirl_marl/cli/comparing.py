@@ -1,4 +1,4 @@
-"""``cirl compare | pareto``: policies and controllers against each other and the best possible."""
+"""``cirl compare | pareto | levers``: policies, controllers and levers against each other and the best possible."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from cirl_marl.cli.common import (
     say,
     shares,
 )
+from cirl_marl.errors import CirlError
 from cirl_marl.jobs import PLACES
 
 
@@ -138,3 +139,50 @@ def pareto(
         say(f"no bound: {front.reason}")
     for path in [*write_front(front, folder, recipe=recipe, **options), *common.browser_report(page, front)]:
         say(f"wrote {path}")
+
+
+@app.command(rich_help_panel=COMPARISONS)
+def levers(
+    network: NetworkName,
+    group: Annotated[
+        list[str] | None, typer.Option(help="Agents that are one lever: NAME=AGENT,AGENT,…; may be repeated.")
+    ] = None,
+    scenario: Scenario = None,
+    min_service: Annotated[
+        float | None,
+        typer.Option(min=0.0, max=1.0, help="Mean level of each service; default: what there is as usual."),
+    ] = None,
+    bounds: Annotated[
+        bool | None,
+        typer.Option(help="Whether the bound of each row is solved; default: unless the network is large."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of levers.csv, .json, .png; default: runs/levers-NETWORK[_SCENARIO].")
+    ] = None,
+) -> None:
+    """Tell what each lever brings: alone, added to those above it, and what is lost without it.
+
+    A lever is an agent; in copies, such as steel_world, the same agent of all regions. All is at the same service.
+    """
+    from cirl_marl.definitions.catalogue import load_network
+    from cirl_marl.evaluation.levers import levers as levers_of
+    from cirl_marl.report.lever_chart import levers_table, write_levers
+
+    groups = dict(_group(text) for text in group or ())
+    variant = load_network(network, scenario=scenario)
+    folder = common.folder_for(out or Path("runs") / f"levers-{common.stem(variant)}", "--out")
+    options: dict[str, Any] = {"groups": groups, "min_service": min_service, "bounds": bounds}
+    with shares() as progress:
+        result = levers_of(variant, progress=progress, **options)
+    console.print(levers_table(result))
+    for path in write_levers(result, folder, **options):
+        say(f"wrote {path}")
+
+
+def _group(text: str) -> tuple[str, list[str]]:
+    """Return name and agents of a lever, as ``--group`` gives them."""
+    name, is_given, agents = text.partition("=")
+    members = common.comma_separated(agents)
+    if not is_given or not name.strip() or not members:
+        raise CirlError(f"--group {text}: needs a name and agents, as in scrap=old_scrap,new_scrap")
+    return name.strip(), members

@@ -15,12 +15,14 @@ from cirl_marl.drawing.digraph import save_before_after
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.assessment import Evaluation
 from cirl_marl.evaluation.comparison import Comparison
+from cirl_marl.evaluation.levers import Levers
 from cirl_marl.evaluation.pareto import ParetoFront
 from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.report import report_page
 from cirl_marl.report.curves import save_circularity, save_learning_curves
 from cirl_marl.report.decisions import decisions_table, save_decisions, savings_table
 from cirl_marl.report.differences import save_alternatives
+from cirl_marl.report.lever_chart import levers_table, save_levers
 from cirl_marl.report.page_html import write_page
 from cirl_marl.report.terminal import evaluation_table
 from cirl_marl.report.tradeoffs import comparison_notes, comparison_table, save_comparison, save_pareto
@@ -47,14 +49,14 @@ def write_report(path: str | Path, result: Reportable) -> Path:
     return write_page(path, _of_its_kind(_PAGES, result, "report")(result))
 
 
-def draw(path: str | Path, result: Reportable, *, title: str = "") -> Path:
+def draw(path: str | Path, result: Reportable | Levers, *, title: str = "") -> Path:
     """Save the picture of a result as a PNG and return its path.
 
     Args:
         path: where it goes.
         result: of ``simulate`` λ, stocks and flows over time; of ``simulate_alternatives`` what differs most; of
-            ``plan`` the levers that differ most from business as usual; of ``compare`` and ``pareto_front`` service
-            against circularity; of ``evaluate`` λ over time.
+            ``plan`` the levers that differ most from business as usual; of ``levers`` what each brings; of ``compare``
+            and ``pareto_front`` service against circularity; of ``evaluate`` λ over time.
         title: heading; empty for one that names the network.
 
     Raises:
@@ -99,12 +101,14 @@ def summarise(result: object) -> RenderableType:
     """Return the tables and sentences that the command line shows of a result, for ``rich.print``.
 
     Args:
-        result: what ``plan``, ``compare`` or ``evaluate`` has returned; of anything else its ``str``.
+        result: what ``plan``, ``compare``, ``levers`` or ``evaluate`` has returned; of anything else its ``str``.
     """
     if isinstance(result, Schedule):
         return Group(decisions_table(result), savings_table(result), str(result))
     if isinstance(result, Comparison):
         return Group(comparison_table(result), *comparison_notes(result))
+    if isinstance(result, Levers):
+        return levers_table(result)
     if isinstance(result, Evaluation):
         return Group(evaluation_table(result.figures), str(result))
     return str(result)
@@ -123,6 +127,7 @@ _PICTURES: Mapping[type, Callable[..., Path]] = {
     Sequence: save_alternatives,
     Schedule: save_decisions,
     Comparison: save_comparison,
+    Levers: save_levers,
     ParetoFront: save_pareto,
     Evaluation: draw_circularity,
 }

@@ -1,0 +1,118 @@
+"""What each lever brings: a table, its CSV file, and a chart that leads from business as usual to all levers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from cirl_marl.drawing.style import FAINT, INK, NEUTRAL, SERIES, WARNING, WIDTH, number, save, style_axes
+from cirl_marl.evaluation.figures import provenance
+from cirl_marl.evaluation.levers import Levers, Trial
+from cirl_marl.records.files import publish_folder, write_json, write_table
+from cirl_marl.report.terminal import text_table
+
+LEVER_FILES = ("levers.csv", "levers.json", "levers.png")
+CASES = ("alone", "with those above", "without it")
+SHOWN = 24
+"""Most levers in the chart; the others stand in one bar."""
+
+
+def levers_table(levers: Levers) -> Table:
+    """One row a lever: what λ̄ gains by it in three ways, and the lowest service and largest gap of these episodes."""
+    rows = []
+    for place, row in enumerate(levers.rows):
+        trials = (row.alone, row.added, row.without)
+        changes = (number(change) for change in levers.changes(place))
+        service, largest = min(trial.service for trial in trials), max(trial.gap or 0.0 for trial in trials)
+        gap = "–" if row.alone.gap is None else f"{largest:.1%}"
+        rows.append([row.name, *changes, f"{levers.share(place):.0%}", f"{service:.4f}", gap])
+    mass = levers.network.mass_unit
+    headings = ["lever", *(f"{case} ({mass})" for case in CASES), "all so far", "lowest service", "largest gap"]
+    title = f"λ̄ as usual {number(levers.usual.circularity)} {mass}, with all levers"
+    title += f" {number(levers.together.circularity)} {mass}, at most {number(levers.plan.objective)} {mass}"
+    return text_table(title, headings, rows, text=["lever"])
+
+
+def write_levers(levers: Levers, folder: Path, **options: Any) -> list[Path]:
+    """Write table, provenance and chart, all of them or none, and return their paths."""
+    mass = levers.network.mass_unit
+    figures = [f"circularity ({mass})", f"change ({mass})", "lowest service", f"bound ({mass})", "gap to bound"]
+    header = ["lever", "agents", *(f"{case}: {figure}" for case in CASES for figure in figures), "all so far"]
+    rows = list(_rows(levers))
+    about: dict[str, Any] = {"provenance": provenance(levers.network, **options), "unit": mass}
+    about |= {"as usual": levers.usual.circularity, "all levers": levers.together.circularity}
+    about["bound"] = levers.plan.objective
+    with publish_folder(folder) as draft:
+        files = [draft / name for name in LEVER_FILES]
+        write_table(files[0], header, rows)
+        write_json(files[1], about | {"columns": header, "rows": rows})
+        save_levers(files[2], levers)
+    return [folder / name for name in LEVER_FILES]
+
+
+def _rows(levers: Levers) -> Iterator[list[object]]:
+    for place, row in enumerate(levers.rows):
+        pairs = zip((row.alone, row.added, row.without), levers.changes(place), strict=True)
+        cells = [cell for trial, change in pairs for cell in _figures(trial, change)]
+        yield [row.name, " ".join(row.agents), *cells, levers.share(place)]
+
+
+def _figures(trial: Trial, change: float) -> list[float | None]:
+    return [trial.circularity, change, trial.service, trial.bound, trial.gap]
+
+
+def save_levers(path: str | Path, levers: Levers, *, title: str = "") -> Path:
+    """Save a chart as a PNG and return its path.
+
+    Left, each lever takes λ̄ on from where those above it left it; right, what it brings alone and what is lost without
+    it. Of many levers the last ones stand in one row.
+    """
+    network, count = levers.network, min(len(levers.rows), SHOWN)
+    changes = np.array([levers.changes(place) for place in range(len(levers.rows))])
+    added = np.append(changes[: count - 1, 1], changes[count - 1 :, 1].sum())
+    names = [row.name for row in levers.rows[:count]]
+    if count < len(levers.rows):
+        names[-1] = f"{len(levers.rows) - count + 1} others"
+    usual, whole = levers.usual.circularity, levers.together.circularity
+    ends, places = usual + np.cumsum(added), np.arange(1, count + 1)
+    figure = Figure(figsize=(WIDTH, 1.7 + 0.34 * (count + 2)), layout="constrained")
+    figure.suptitle(title or f"{network.title or network.name}: what each lever brings", fontsize=12, fontweight="bold")
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(2.1, 1))
+    span = max(abs(levers.plan.objective - usual), abs(whole - usual)) or 1.0
+    for place, end, change in zip(places, ends, added, strict=True):
+        left.barh(place, change, left=end - change, height=0.62, color=SERIES[0] if change >= 0 else WARNING)
+        left.plot([end, end], [place, place + 1], color=NEUTRAL, linewidth=0.8)
+        text = f"+{number(change)}" if change > 0 else number(change)
+        part = f"  {(end - usual) / (whole - usual):.0%}" if whole != usual else ""
+        outward = max(end, end - change) + 0.015 * span
+        left.text(outward, place, f"{text}{part}", va="center", fontsize=8, color=INK)
+    left.plot([usual, usual], [0, 1], color=NEUTRAL, linewidth=0.8)
+    for tick, value in ((0, usual), (count + 1, whole)):
+        left.plot(value, tick, "D", color=INK, markersize=6)
+        left.text(value + 0.03 * span, tick, number(value), va="center", fontsize=8, color=INK)
+    left.axvline(levers.plan.objective, color=FAINT, linestyle="--", linewidth=1, label="no plan exceeds this")
+    left.set_yticks([0, *places, count + 1], ["as usual", *names, "all levers"])
+    left.invert_yaxis()
+    left.set_xlim(min(usual, *ends) - 0.04 * span, max(levers.plan.objective, *ends, usual) + 0.22 * span)
+    shown = changes[:count]
+    right.hlines(places, shown[:, [0, 2]].min(axis=1), shown[:, [0, 2]].max(axis=1), color=NEUTRAL, linewidth=1.5)
+    right.plot(shown[:, 0], places, "o", color=SERIES[2], markersize=6, label="it alone")
+    right.plot(
+        shown[:, 2], places, "o", markerfacecolor="white", color=SERIES[1], markersize=6, label="lost without it"
+    )
+    right.axvline(0.0, color=NEUTRAL, linewidth=1)
+    mass = network.mass_unit
+    style_axes(left, title="added to those above, and the share of all so far", size=8.5)
+    style_axes(right, title="by itself", size=8.5)
+    for axes, label in ((left, f"λ̄ / {mass}"), (right, f"change of λ̄ / {mass}")):
+        axes.set_xlabel(label, fontsize=9)
+        axes.grid(False, axis="y")
+        axes.tick_params(axis="y", length=0, labelcolor=INK)
+        axes.locator_params(axis="x", nbins=5)
+        axes.legend(loc="lower left" if axes is left else "lower right", frameon=False, fontsize=8)
+    return save(figure, path)
