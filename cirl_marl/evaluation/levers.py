@@ -160,24 +160,24 @@ class _Trials:
         order, rest = list[str](), list(self._by_lever)
         while rest:
             progress(1 - len(rest) ** 2 / len(self._by_lever) ** 2)
-            best = max(rest, key=lambda name: self._promise(self._planned([*order, name])))
+            best = max(rest, key=lambda name: self._promise(self._part_of_plan([*order, name])))
             order.append(best)
             rest.remove(best)
         return order
 
     def best(self, names: Iterable[str]) -> Trial:
         """Return the better of two episodes in which these levers are pulled: as all are planned, and these alone."""
-        planned = self._planned(names)
-        run = simulate_plan(planned)
+        part = self._part_of_plan(names)
+        run = simulate_plan(part)
         if not self._solves:
             return Trial(run, None)
-        alone = self._bound(planned.agents)
+        alone = self._bound(part.agents)
         if self._lacks(run):
             alone = improve_plan(alone, rounds=ROUNDS, enough=lambda trial: not self._lacks(trial))
         return Trial(max(run, simulate_plan(alone), key=self._worth), alone.objective)
 
-    def _promise(self, planned: Bound) -> float:
-        return self._bound(planned.agents).objective if self._solves else self._worth(simulate_plan(planned))
+    def _promise(self, part: Bound) -> float:
+        return self._bound(part.agents).objective if self._solves else self._worth(simulate_plan(part))
 
     def _bound(self, agents: tuple[str, ...]) -> Bound:
         """Return the bound while only these agents act."""
@@ -185,7 +185,7 @@ class _Trials:
             self._bounds[agents] = bound(self._plan.network, min_service=self._plan.min_service, agents=agents)
         return self._bounds[agents]
 
-    def _planned(self, names: Iterable[str]) -> Bound:
+    def _part_of_plan(self, names: Iterable[str]) -> Bound:
         """Return the plan of all with these levers alone."""
         chosen = {agent for name in names for agent in self._by_lever[name]}
         agents = tuple(agent for agent in self._plan.agents if agent in chosen)
