@@ -8,90 +8,52 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.document import write_sections
-from cirl_marl import MultiAgentVectorEnv, load_network
+from cirl_marl import Levers, MultiAgentVectorEnv, levers, load_network
 from cirl_marl.controllers import Constant, Neutral
-from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
+from cirl_marl.controllers.rollout import episode_start, rollout
 from cirl_marl.evaluation import Comparison, compare
 from cirl_marl.evaluation.sampling import sample_episodes, sensitivities
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
-from cirl_marl.optimum import Bound, bound, gap, improve_plan, simulate_plan
+from cirl_marl.optimum import gap
 from cirl_marl.report.decisions import savings
+from cirl_marl.report.lever_chart import save_levers
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "japan.md"
 NAME = "steel_japan"
 SAMPLES, EPISODES = 500, 8
 TOGETHER = {"what is exported, steel or goods": ("semis_exports", "long_exports", "flat_exports", "goods_exports")}
-"""Agents that owe a service together: one of them alone cannot do as is planned and still provide it."""
+"""Agents of one decision: what Japan exports, whatever its form."""
 
 
-class Levers:
-    """A plan of all agents, of which some may be left as usual."""
-
-    def __init__(self, plan: Bound) -> None:
-        """Take the actions of ``plan``, and those while nobody acts."""
-        self.plan, self.network = plan, plan.network
-        env = MultiAgentVectorEnv(self.network, num_envs=1)
-        named = {self.network.compartments[agent].label: (agent,) for agent in env.agents}
-        together = {agent for agents in TOGETHER.values() for agent in agents}
-        self.agents = {name: agents for name, agents in named.items() if not together & {*agents}} | TOGETHER
-        episode_start(env).reset(env)
-        usual = np.empty_like(plan.actions)
-        for step in range(len(plan.actions)):
-            usual[step] = env.stack(env.neutral_action)[:, 0]
-            env.advance(usual[step][:, None])
-        self._usual, self._entries = usual, {agent: k for k, agent in enumerate(env.agents)}
-
-    def pulled(self, levers: set[str]) -> Rollout:
-        """Return the episode in which the agents of these levers do what is planned, and the others nothing."""
-        actions = self._usual.copy()
-        entries = [self._entries[agent] for lever in levers for agent in self.agents[lever]]
-        actions[:, entries] = self.plan.actions[:, entries]
-        return simulate_plan(replace(self.plan, actions=actions))
-
-
-def question(plan: Bound) -> Iterator[str]:
+def question(result: Levers) -> Iterator[str]:
     """Yield what is taken and lost, as usual and as planned."""
-    levers = Levers(plan)
-    usual, planned = levers.pulled(set()), levers.pulled(set(levers.agents))
     yield "| 2025–2050, Mt | as usual | plan | saved |"
     yield "|-|-|-|-|"
-    for what, with_plan, without in savings(plan.network, planned, usual):
+    for what, with_plan, without in savings(result.network, result.together.run, result.usual.run):
         yield f"| {what} | {without / 1e3:.0f} | {with_plan / 1e3:.0f} | {(without - with_plan) / without:.0%} |"
-    off = float(gap(plan.verify().bound, planned.episode_circularity[0]))
     yield ""
-    yield f"The bound is λ̄ = {plan.verify().bound / 1e3:.2f} Mt/a; the plan is {off:.2%} from it, at full service."
+    limit = result.plan.verify().bound
+    off = float(gap(limit, result.together.circularity))
+    yield f"The bound is λ̄ = {limit / 1e3:.2f} Mt/a; the plan is {off:.2%} from it, at full service."
 
 
-def order(plan: Bound) -> Iterator[str]:
+def order(result: Levers) -> Iterator[str]:
     """Yield the levers in the order in which each adds most to those before it."""
-    levers = Levers(plan)
-    everyone, pulled = set(levers.agents), set[str]()
-    first, whole = (levers.pulled(each).episode_circularity[0] for each in (pulled, everyone))
-    yield "| lever | alone, Mt/a | with those above, Mt/a | without it, Mt/a | all so far | lowest service |"
-    yield "|-|-|-|-|-|-|"
-    alone = {lever: _value(levers.pulled({lever}), first) for lever in everyone}
-    last = {lever: whole - levers.pulled(everyone - {lever}).episode_circularity[0] for lever in everyone}
-    before = first
-    while pulled != everyone:
-        runs = {lever: levers.pulled(pulled | {lever}) for lever in sorted(everyone - pulled)}
-        best = max(runs, key=lambda lever: runs[lever].episode_circularity[0])
-        pulled.add(best)
-        reached = float(runs[best].episode_circularity[0])
-        said = " | ".join(f"{each / 1e3:+.2f}" for each in (alone[best], reached - before, last[best]))
-        before = reached
-        least = float(runs[best].levels[0].mean(axis=1).min())
-        yield f"| {best} | {said} | {(before - first) / (whole - first):.0%} | {least:.3f} |"
-
-
-def _value(run: Rollout, usual: float) -> float:
-    return float(run.episode_circularity[0] - usual)
+    yield "| lever | alone, Mt/a | with those above, Mt/a | without it, Mt/a | all so far |"
+    yield "|-|-|-|-|-|"
+    for place, row in enumerate(result.rows):
+        changes = " | ".join(f"{change / 1e3:+.2f}" for change in result.changes(place))
+        yield f"| {row.name} | {changes} | {result.share(place):.0%} |"
+    trials = [trial for row in result.rows for trial in (row.alone, row.added, row.without)]
+    least, most = min(trial.service for trial in trials), max(trial.gap or 0.0 for trial in trials)
+    yield ""
+    yield f"The lowest service of these {len(trials)} episodes is {least:.4f}, the largest gap to a bound {most:.1%}."
 
 
 def lives() -> Iterator[str]:
@@ -109,7 +71,7 @@ def lives() -> Iterator[str]:
             env, Constant({**neutral, **dict.fromkeys(held, 1.0)}), seed=begun.seed, start=begun.initial_state
         )
         label = name if name not in network.compartments else network.compartments[name].label.lower()
-        change = _value(run, usual.episode_circularity[0])
+        change = float(run.episode_circularity[0] - usual.episode_circularity[0])
         least = run.levels[0].mean(axis=1).min()
         yield f"| {label} | {run.episode_circularity[0] / 1e3:.2f} | {change / 1e3:+.2f} | {least:.3f} |"
 
@@ -164,10 +126,11 @@ def main() -> None:
     parser.add_argument("--run", type=Path, help="agents trained by cirl train steel_japan")
     asked = parser.parse_args()
     network = load_network(NAME)
-    plan = improve_plan(bound(network, min_service=1.0))
+    result = levers(network, groups=TOGETHER)
+    save_levers(DOCUMENT.parent / "pictures" / "japan_levers.png", result)
     parts = {
-        "saved": question(plan),
-        "levers": order(plan),
+        "saved": question(result),
+        "levers": order(result),
         "lives": lives(),
         "spread": spread(network),
         "known": under_uncertainty(asked.run),
