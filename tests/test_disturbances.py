@@ -404,8 +404,16 @@ def test_capacities_in_files(tmp_path: Path) -> None:
         ("high = 8.0", "high = 6.0", None),
         ("values = [1.0, 0.4, 0.7]", "values = [1.0, 0.1, 0.7]", "'outage' it may be 0.8, below control.low 1; lower"),
         ('disturbed_by = "outage"', 'disturbed_by = "outrage"', "disturbed_by: .*Did you mean 'outage'"),
+        ("rate = {value = 0.2", 'rate = {disturbed_by = "outrage", value = 0.2', "Did you mean 'outage'"),
+        ("initial = {", 'initial = {disturbed_by = "outage", ', "initial.disturbed_by: only rates, flows, shares"),
+        (
+            "rate = {value = 0.2",
+            'rate = {multiplied_by = {value = 2.0, unit = "1", source = "x", disturbed_by = "outage"}, value = 0.2',
+            "rate.multiplied_by.disturbed_by: belongs beside it",
+        ),
     ):
-        path.write_text(text.replace(old, new))
+        assert old in text
+        path.write_text(text.replace(old, new, 1))
         if message is None:
             load_network(path)
         else:
@@ -420,7 +428,7 @@ def test_capacities_in_files(tmp_path: Path) -> None:
     for part, message in (
         ("arcs.tails", "a control of kind 'share' has no capacity: shares are parts of a whole"),
         ("arcs.leak", "arcs.leak.control.high: it has no control"),
-        ("services.metal_kept", "of services these can be uncertain: low, high; 'control.high' cannot"),
+        ("services.metal_kept", "of services these can be uncertain or disturbed: low, high; 'control.high' cannot"),
     ):
         with pytest.raises(NetworkError, match=message):
             replace(shares, disturbed={f"{part}.{CAPACITY}": DisturbanceEffect(by="outage")})
@@ -483,7 +491,7 @@ def test_mistakes_of_disturbances_are_named(changes: dict[str, Disturbance], mes
     ("disturbed", "correlation", "message"),
     [
         ({"arcs.dig.flow": DisturbanceEffect(by="prise")}, None, "arcs.dig.flow: disturbed_by: .*Did you mean 'price'"),
-        ({"arcs.dig.flw": DisturbanceEffect(by="price")}, None, "of arcs these can be uncertain"),
+        ({"arcs.dig.flw": DisturbanceEffect(by="price")}, None, "of arcs these can be uncertain or disturbed"),
         ({"arcs.leak.flow": DisturbanceEffect(by="price")}, None, "arcs.leak.flow: it is 0"),
         (
             {"nodes.store.stretch": DisturbanceEffect(by="price")},

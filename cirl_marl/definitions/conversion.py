@@ -27,6 +27,8 @@ from cirl_marl.network.units import factor
 FLOW_KEYS = ("rate", "flow", "batches")
 """Keys of which a law needs one, if it takes any of them."""
 CONSTANT = "cannot change in time; fix the time, too, in 'where', and leave no column of times"
+UNCERTAINTY = ("deviation", "range", "distribution", "disturbed_by", "disturbed_as")
+"""Keys that say how a quantity is not certain."""
 REGION = "{region}"
 """What stands for the text of the region in the title and in ``where``."""
 
@@ -261,6 +263,9 @@ class Converter:
         multiplier, name = quantity.multiplied_by, quantity.unit
         if multiplier is not None:
             name = f"({name})*({multiplier.unit})"
+            for key in UNCERTAINTY:
+                if getattr(multiplier, key) is not None:
+                    self.mistakes.append(f"{path}.multiplied_by.{key}: belongs beside it, to the product")
             if multiplier.multiplied_by is not None:
                 self.mistakes.append(
                     f"{path}.multiplied_by.multiplied_by: a quantity has one factor; multiply the others"

@@ -291,7 +291,7 @@ def _uncertain_field(network: Specification, path: str) -> tuple[Any, str]:
     """
     kind, id_, name = _split(path)
     if kind not in KINDS:
-        raise KeyError(f"only numbers of {', '.join(KINDS)} can be uncertain")
+        raise KeyError(f"only numbers of {', '.join(KINDS)} can be uncertain or disturbed")
     parts = {part.id: part for part in getattr(network, kind)}
     if id_ not in parts:
         raise KeyError(unknown_name(kind[:-1], id_, parts))
@@ -303,7 +303,7 @@ def _uncertain_field(network: Specification, path: str) -> tuple[Any, str]:
     ]
     options += [CAPACITY] * ("control" in fields)
     if name not in options:
-        raise KeyError(f"of {kind} these can be uncertain: {', '.join(options)}; '{name}' cannot")
+        raise KeyError(f"of {kind} these can be uncertain or disturbed: {', '.join(options)}; '{name}' cannot")
     if name == CAPACITY and parts[id_].control is None:
         raise KeyError("it has no control")
     if _number(parts[id_], name) is None:
