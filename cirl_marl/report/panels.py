@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,8 @@ from cirl_marl.network import Network
 
 PANELS, COLUMNS = 8, 2
 """Largest number of panels of a picture, and how many stand side by side."""
+LINE = 80
+"""Characters of a line of the title."""
 LEVELS = (-0.03, 1.06)
 """Limits of axes that show service levels."""
 
@@ -35,7 +38,7 @@ def save_panels(path: str | Path, network: Network, panels: Sequence[Panel], *, 
     """Save panels as a PNG and return its path; the legend, in so many columns, is that of the first panel."""
     rows = math.ceil(len(panels) / COLUMNS)
     figure = Figure(figsize=(WIDTH, 1.0 + 2.1 * rows), layout="constrained")
-    figure.suptitle(title, fontsize=11, fontweight="bold")
+    figure.suptitle(textwrap.fill(title, LINE), fontsize=11, fontweight="bold")
     grid = figure.subplots(rows, COLUMNS, squeeze=False).ravel()
     span = axis_time(np.array([0.0, interval_ends(network)[-1]]), network)
     for axes, panel in zip(grid, panels, strict=False):
