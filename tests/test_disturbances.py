@@ -383,6 +383,13 @@ def test_capacities_are_disturbed() -> None:
         other = env.dynamics.advance(before.stock, before.inner, controls, before.step, factors)
         expected = outcome.circularity - network.circularity(other.flow)
         np.testing.assert_allclose(outcome.reward[env.agents.index("dig")], expected, atol=1e-9)
+    idle = MultiAgentVectorEnv(network, num_envs=3, agents=["furnace"])
+    idle.reset(seed=1)
+    idle.advance(np.zeros((1, 3)))
+    np.testing.assert_allclose(idle.controls[1], np.minimum(6.0, 8.0 * idle.physical.disturbances[0, 1]))
+    faster = {f"nodes.furnace.{CAPACITY}": DisturbanceEffect(by="boom")}
+    furnace = MultiAgentVectorEnv(replace(network, disturbed=faster), num_envs=1).dynamics
+    assert furnace.turnover[network.node_index["furnace"]] == pytest.approx(0.2 * 1.5)
     makes_up = replace(works(makes_up_for="molten"), disturbances=names, disturbed=disturbed)
     run = rollout(MultiAgentVectorEnv(makes_up, num_envs=2), Neutral(), seed=5)
     path = makes_up.processes.sample([5]).values[:-1, :, 0]

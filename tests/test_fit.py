@@ -133,7 +133,11 @@ def test_factors_and_summands_of_the_values_themselves(tmp_path: Path) -> None:
     assert factor.deviation == pytest.approx(0.15, rel=0.2) and summand.deviation == pytest.approx(4.0, rel=0.2)
     assert factor.persistence == pytest.approx(0.7, abs=0.1) == summand.persistence
     assert added.trends["absolute"][0] == pytest.approx(0.2, abs=0.03)
-    half = fit_disturbances(table, ["relative"], logarithm=False, interval="6 month").disturbances["relative"]
+    halves = fit_disturbances(table, ["relative"], logarithm=False, interval="6 month")
+    half, ends = halves.disturbances["relative"], [factor.persistence + e for e in (-1e-3, 1e-3)]
+    slope = np.diff(np.sqrt(ends))[0] / 2e-3
+    whole = fit_disturbances(table, ["relative"], logarithm=False).errors["relative"]["persistence"]
+    assert halves.errors["relative"]["persistence"] == pytest.approx(slope * np.max(whole), rel=1e-4)
     assert isinstance(half, AutoRegression) and half.persistence == pytest.approx(factor.persistence**0.5, abs=1e-4)
     wild = write(tmp_path / "w.csv", {"x": np.abs(1 + 0.6 * noise)})
     assert fit_disturbances(wild, ["x"], logarithm=False).disturbances["x"].ends[0] == 0.0

@@ -76,8 +76,8 @@ def _mistake(item: Mapping[str, Any], model: type[BaseModel]) -> str:
     if item["type"] == "extra_forbidden" and location[::2] == ["arcs", "series"]:
         return f"{path}: write flow = {{ times = […], values = […], time_unit = …, unit = …, source = … }}"
     if item["type"] == "extra_forbidden" and location[-1] in ("disturbed_by", "disturbed_as"):
-        options = "rates, flows, shares, capacities (of a control), stretches (of lifetimes) and bands"
-        return f"{path}: only {options} can be disturbed"
+        numbers = "rates, flows, shares, capacities (of a control), stretches (of lifetimes) and bands"
+        return f"{path}: only {numbers} can be disturbed"
     if item["type"] == "extra_forbidden":
         parent = _model_at(model, location[:-1])
         options = [f.alias or name for name, f in parent.model_fields.items()] if parent else []
