@@ -63,8 +63,11 @@ def plan(
 def _proof(controller: Controller, table: Schedule) -> str:
     """Say what λ̄ no episode with this service exceeds, and how far the plan stays below; empty where nothing does.
 
-    Of λ̄/scale + w·service ≤ β follows λ̄ ≤ scale·(β − w·service) for all that serve as much.
+    Of λ̄/scale + w·service ≤ β follows λ̄ ≤ scale·(β − w·service) for all that serve as much. Of a disturbed network the
+    program is that of what is expected, which bounds no episode.
     """
+    if table.network.disturbed:
+        return ""
     if not isinstance(controller, Optimum) or not isinstance(solution := controller.plans[0], Bound):
         return ""
     network, run, limit, demand = table.network, table.rollout, solution.objective, "any service"
