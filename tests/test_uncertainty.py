@@ -208,7 +208,7 @@ def test_what_cannot_spread_is_refused(written: str, said: str, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("where", "said"),
     [
-        ("arcs.dig.flw", r"of arcs these can be uncertain: rate, share, flow; 'flw' cannot"),
+        ("arcs.dig.flw", r"of arcs these can be uncertain or disturbed: rate, share, flow, control.high; 'flw'"),
         ("arcs.dg.flow", r"unknown arc 'dg'. Did you mean 'dig'"),
         ("episode.horizon", r"only numbers of nodes, arcs, services can be uncertain"),
         ("arcs.metal.share", r"'share' is not given"),
