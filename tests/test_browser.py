@@ -6,6 +6,8 @@ import csv
 import io
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,6 +23,7 @@ from cirl_marl.evaluation.statistics import Aggregate
 from cirl_marl.report.page_html import write_page
 from cirl_marl.report.report_page import PLAN, PlanePoint, ReportPage, page_of_alternatives
 
+ROOT = Path(__file__).parent.parent
 NEEDED = "a browser: Playwright of the extra 'browser', and Chromium (apt-get install chromium)"
 FLAGS = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
@@ -214,6 +217,33 @@ def test_phone_dark_and_motion(tmp_path: Path, opened: Any) -> None:
     np.testing.assert_allclose(wide.widths(), still.widths(), atol=0.02)
 
 
+def test_phones_show_all_of_a_wide_network_and_of_its_figures(tmp_path: Path, opened: Any) -> None:
+    """No figure of the outcome is cut; the diagram opens whole, and large around its broadest box at a button."""
+    found = page_of_alternatives(simulate_alternatives("steel_japan", steps=2))
+    names = ("circularity", "gain", "service", "bound", "gap")
+    figures = {name: Aggregate(-91166.0 if name in ("circularity", "bound") else 0.9, -92e3, 0.95) for name in names}
+    story = replace(found, episodes=tuple(replace(each, figures=figures) for each in found.episodes))
+    tab = opened(write_page(tmp_path / "page.html", story), viewport={"width": 390, "height": 844}, has_touch=True)
+    page, diagram = tab.page, tab.page.locator("svg[role=listbox]")
+    assert page.evaluate("document.documentElement.scrollWidth") == 390
+    cells = page.locator("#outcome-table td")
+    assert cells.count() == len(names) and page.locator("#outcome-table td >> nth=0").get_attribute("data-column")
+    spans = [cells.nth(i).bounding_box() for i in range(cells.count())]
+    assert all(span["x"] >= 0 and span["x"] + span["width"] <= 390 for span in spans)
+    assert page.evaluate("(e => e.scrollWidth <= e.clientWidth)(document.getElementById('outcome-table'))")
+    whole = diagram.bounding_box()
+    assert whole["x"] >= 0 and whole["x"] + whole["width"] <= 390
+    page.get_by_role("button", name="Enlarge").click()
+    assert diagram.bounding_box()["width"] > 1.2 * whole["width"]
+    widths = page.eval_on_selector_all(".box .body", "all => all.map(e => e.getBoundingClientRect().width)")
+    broadest = page.locator(".box .body").nth(int(np.argmax(widths))).bounding_box()
+    assert 0 <= broadest["x"] + broadest["width"] / 2 <= 390
+    page.get_by_role("button", name="Show all of it").click()
+    assert diagram.bounding_box()["width"] == whole["width"]
+    small = write_page(tmp_path / "small.html", page_of_alternatives(two(tmp_path)))
+    assert opened(small, viewport={"width": 390, "height": 844}).page.locator(".size").count() == 0
+
+
 def test_groups_points_and_plans(tmp_path: Path, opened: Any) -> None:
     """A world opens on its countries and one unfolds and folds again; a plan is what λ is held against; points."""
     story = page_of_alternatives(simulate_alternatives(world(), controls=["neutral", "random"]))
@@ -249,6 +279,42 @@ def test_groups_points_and_plans(tmp_path: Path, opened: Any) -> None:
     assert not bare.page.locator("#network").is_visible() and not bare.page.locator("#timed").is_visible()
     assert len(bare.texts("#figures tbody tr")) == 4
     assert [row["value"] for row in bare.downloaded() if row["scene"] == "plans"] == ["0.9", "-2", "0.95", "-3"]
+
+
+SEARCHED = """\
+INHERIT: {mkdocs}
+docs_dir: {docs}
+plugins: [search, offline]
+hooks: []
+extra_css: []
+nav: [{{First: first.md}}, {{Second: second.md}}]
+"""
+
+
+@pytest.mark.slow
+def test_a_site_is_searched_from_a_disk(tmp_path: Path, chromium: Any) -> None:
+    """With our theme, plugins and script, a word leads to its page without a server, and nothing is fetched."""
+    pytest.importorskip("material", reason="needs the extra 'docs'")
+    docs = tmp_path / "docs"
+    (docs / "docs" / "site").mkdir(parents=True)
+    (docs / "first.md").write_text("# First\n\nNothing of note.\n")
+    (docs / "second.md").write_text("# Second\n\nThe quokka is here.\n")
+    script = "docs/site/iframe-worker.js"
+    (docs / script).write_text((ROOT / script).read_text())
+    config = tmp_path / "mkdocs.yml"
+    config.write_text(SEARCHED.format(mkdocs=ROOT / "mkdocs.yml", docs=docs))
+    command = [sys.executable, "-m", "mkdocs", "build", "-q", "-f", str(config), "-d", str(tmp_path / "site")]
+    run = subprocess.run(command, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"}, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    page, requests = chromium.new_page(), list[str]()
+    page.on("request", lambda request: requests.append(request.url))
+    page.goto((tmp_path / "site" / "first.html").as_uri())
+    page.locator("header label[for=__search]").click() if page.viewport_size["width"] < 960 else None
+    page.locator(".md-search__input").fill("quokka")
+    page.locator(".md-search-result__item a").first.click()
+    page.wait_for_url("**/second.html*")
+    page.close()
+    assert all(request.startswith(("file:", "data:", "about:")) for request in requests)
 
 
 @pytest.mark.slow

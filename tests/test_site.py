@@ -29,7 +29,7 @@ from docs.site import notebooks
 from docs.site.api import api_pages
 from docs.site.markdown import ROOT, WRITTEN, sections_about, shown, table
 from docs.site.models import model_page
-from docs.site.networks import STUDY, check_study, network_page
+from docs.site.networks import LEGIBLE, STUDY, check_study, network_page
 from docs.site.recipes import recipe_page
 
 SCRIPTS = sorted(notebooks.FOLDER.glob("*.py"))
@@ -80,8 +80,11 @@ def test_network_pages_say_what_definitions_say(name: str) -> None:
         kept = read_plan(name)
         assert ["best plan known", f"{kept.circularity:.5g}"] in [row[:2] for row in rows]
         assert kept.bound is None or ["bound", f"{kept.bound:.5g}", f"≥ {kept.min_service:g}", ""] in rows
-        assert set(page.files) == {f"{name}.png", f"{name}_plan.png"}
-        assert all(content.startswith(b"\x89PNG") for content in page.files.values())
+        is_small = len(network.nodes) <= LEGIBLE or network.copies
+        drawing = f"{name}.png" if is_small else f"{name}_flows.html"
+        assert set(page.files) == {drawing, f"{name}_plan.png"} and drawing in page.text
+        pictures = [content for file, content in page.files.items() if file.endswith(".png")]
+        assert all(content.startswith(b"\x89PNG") for content in pictures)
 
 
 @pytest.mark.medium

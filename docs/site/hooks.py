@@ -76,8 +76,8 @@ def on_files(files: Files, config: Any) -> Files:
     for uri in sorted(set(_linked(kept))):
         if kept.get_file_from_path(uri) is None:
             kept.append(File.generated(config, uri, abs_src_path=str(ROOT / uri)))
-    style = "docs/site/style.css"
-    kept.append(File.generated(config, style, abs_src_path=str(ROOT / style)))
+    for part in ("docs/site/style.css", "docs/site/iframe-worker.js"):
+        kept.append(File.generated(config, part, abs_src_path=str(ROOT / part)))
     _check_notebooks()
     return kept
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import csv
 import json
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.best_plans import LEFT_OUT, read_plan, replayed
-from cirl_marl import MultiAgentVectorEnv, Network, load_network
+from cirl_marl import MultiAgentVectorEnv, Network, load_network, simulate
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import episode_start, rollout
 from cirl_marl.controllers.schedule import Schedule
@@ -25,10 +26,14 @@ from cirl_marl.network.declarations import TimeDependent
 from cirl_marl.network.elements import Law, Service
 from cirl_marl.optimum import gap
 from cirl_marl.report.decisions import decisions_table, save_decisions, savings_table, settings
+from cirl_marl.report.page_html import write_page
+from cirl_marl.report.report_page import page_of_alternatives
 from cirl_marl.report.terminal import arcs_table, nodes_table
 from docs.site.markdown import ROOT, GeneratedPage, folded, sections_about, shown, table
 
 STUDY = ROOT / "benchmarks" / "results" / "study"
+LEGIBLE = 20
+"""Nodes up to which a picture is read at the width of a page."""
 TERMS = 16
 """Flows up to which the formula of λ names each."""
 SAME = 1e-6
@@ -48,13 +53,19 @@ def network_page(name: str) -> GeneratedPage:
     begun.reset(env)
     stock, flow = env.rows.stocks(env.physical.stock)[:, 0].copy(), env.physical.flow[:, 0].copy()
     circularity = float(network.circularity(flow))
-    files = {f"{name}.png": _picture(lambda path: save_network(path, network, stock, flow, circularity=circularity))}
+    files: dict[str, bytes] = {}
+    if len(network.nodes) <= LEGIBLE or network.copies:
+        save = partial(save_network, network=network, stock=stock, flow=flow, circularity=circularity)
+        files[f"{name}.png"] = _picture("png", save)
+    else:
+        report = page_of_alternatives([simulate(network)])
+        files[f"{name}_flows.html"] = _picture("html", lambda path: write_page(path, report))
     folded_away, stocks, flows = folded_network(network, stock, flow)
     parts = [
         f"# {name}",
         f"{network.title}. {_size(network)}",
         _more(name, network),
-        f"![{name} at the start of an episode]({name}.png)",
+        _drawing(name, files),
         f"Stocks and flows at the start of an episode: {begun.description}. λ = {circularity:.5g} {network.mass_unit}.",
         "## Circularity",
         _formula(network),
@@ -76,9 +87,17 @@ def network_page(name: str) -> GeneratedPage:
     return GeneratedPage(f"networks/{name}.md", name, "\n\n".join(part for part in parts if part) + "\n", files)
 
 
-def _picture(save: Callable[[Path], object]) -> bytes:
+def _drawing(name: str, files: Mapping[str, bytes]) -> str:
+    """Show the picture or, of a network too large for one, the diagram of a report for the browser."""
+    if f"{name}.png" in files:
+        return f"![{name} at the start of an episode]({name}.png)"
+    frame = f'<iframe class="flows" src="{name}_flows.html#network" title="Flows of {name} as usual"></iframe>'
+    return f"{frame}\n\nWhile nobody acts, year by year: [open it alone]({name}_flows.html)."
+
+
+def _picture(kind: str, save: Callable[[Path], object]) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "picture.png"
+        path = Path(folder) / f"picture.{kind}"
         save(path)
         return path.read_bytes()
 
@@ -225,7 +244,7 @@ def _plan(name: str, files: dict[str, bytes]) -> Iterator[str]:
     yield table(("who acts", f"λ̄ ({mass})", "lowest service", "gap to the bound"), rows)
     yield f"What the plan does, beside business as usual:\n\n{shown(decisions_table(found))}"
     yield f"What it saves in an episode, in {mass}:\n\n{shown(savings_table(found))}"
-    files[f"{name}_plan.png"] = _picture(lambda path: _draw(path, found, name))
+    files[f"{name}_plan.png"] = _picture("png", lambda path: _draw(path, found, name))
     yield f"![The best plan of {name} and business as usual]({name}_plan.png)"
     yield f"Made by `python -m benchmarks.best_plans {name}`, and carried out anew for this page."
 

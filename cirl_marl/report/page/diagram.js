@@ -1,12 +1,12 @@
 // The network: boxes with levels, ribbons as wide as their flows, loops as loops. One diagram shows one scene.
 
-import { draw } from "./elements.js";
+import { draw, make } from "./elements.js";
 import { figure, measured } from "./figures.js";
 import { endsOf, frameOf, headOf, labelAt, lineOf } from "./ribbons.js";
 import { still } from "./clock.js";
 
 const NARROW = 560;
-/** The least scale at which labels are read; what is wider scrolls. */
+/** The least scale at which labels are read; what is wider than the page is shown whole, and large at a button. */
 export const LEAST = 0.78;
 const LETTER = 5.9;
 const NAMED = 6.9;
@@ -54,6 +54,7 @@ export function diagramOf(host, story, scene, sketch, told) {
   let parts = null;
   let flowing = null;
   let going = 0;
+  let large = false;
 
   function build(room) {
     frame = frameOf(sketch, room < NARROW ? "standing" : "lying", room);
@@ -75,10 +76,28 @@ export function diagramOf(host, story, scene, sketch, told) {
       draw("g", { role: "none" }, ...boxes.map((each) => each.item)),
       draw("g", { "aria-hidden": "true", class: "amounts" }, ...labels),
     );
-    svg.style.minWidth = `${Math.round(width * LEAST)}px`;
     svg.style.maxWidth = `${Math.round(width * 1.15)}px`;
-    host.replaceChildren(svg);
+    const least = Math.round(width * LEAST);
+    host.replaceChildren(...(room < least ? [sizes(svg, least)] : []), svg);
     flowing = null;
+  }
+
+  /** The button that shows a wide diagram so large that labels are read, around its broadest box, and whole again. */
+  function sizes(svg, least) {
+    const button = make("button", { type: "button", class: "size" });
+    const broadest = frame.boxes.reduce((one, two) => (two.breadth > one.breadth ? two : one));
+    const show = () => {
+      button.textContent = large ? "Show all of it" : "Enlarge";
+      svg.style.minWidth = large ? `${least}px` : "0";
+      const centre = ((frame.lying ? broadest.centre : broadest.at) / frame.size[0]) * least;
+      host.scrollLeft = large ? centre - host.clientWidth / 2 : 0;
+    };
+    button.addEventListener("click", () => {
+      large = !large;
+      show();
+    });
+    window.requestAnimationFrame(show);
+    return button;
   }
 
   function option(kind, place, look, children) {

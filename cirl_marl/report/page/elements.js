@@ -34,7 +34,8 @@ export function shown(id) {
 
 /** A table of rows of texts and elements, each row headed by its first cell; cells of numbers stand to the right. */
 export function tableOf(caption, header, rows) {
-  const cell = (value, i, tag) => make(tag, { class: i ? "figure" : "", scope: tag === "th" ? "row" : null }, value);
+  const attributes = (i) => (i ? { class: "figure", "data-column": header[i] } : { class: "", scope: "row" });
+  const cell = (value, i, tag) => make(tag, attributes(i), value);
   return make(
     "table",
     {},
