@@ -309,9 +309,9 @@ def test_a_site_is_searched_from_a_disk(tmp_path: Path, chromium: Any) -> None:
     page, requests = chromium.new_page(), list[str]()
     page.on("request", lambda request: requests.append(request.url))
     page.goto((tmp_path / "site" / "first.html").as_uri())
-    page.locator("header label[for=__search]").click() if page.viewport_size["width"] < 960 else None
-    page.locator(".md-search__input").fill("quokka")
-    page.locator(".md-search-result__item a").first.click()
+    page.locator(".md-search__input").click()
+    page.locator(".md-search__input").press_sequentially("quokka")
+    page.locator(".md-search-result__link").first.click()
     page.wait_for_url("**/second.html*")
     page.close()
     assert all(request.startswith(("file:", "data:", "about:")) for request in requests)

@@ -21,7 +21,10 @@ from typer.testing import CliRunner
 from cirl_marl import (
     Arc,
     CirlError,
+    Constant,
+    Control,
     ControlError,
+    ControlKind,
     Episode,
     Law,
     MultiAgentVectorEnv,
@@ -208,7 +211,8 @@ def test_what_cannot_spread_is_refused(written: str, said: str, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("where", "said"),
     [
-        ("arcs.dig.flw", r"of arcs these can be uncertain or disturbed: rate, share, flow, control.high; 'flw'"),
+        ("arcs.dig.flw", r"can be uncertain or disturbed: rate, share, flow, control, control.high; 'flw'"),
+        ("arcs.dig.control", r"'control' is not given"),
         ("arcs.dg.flow", r"unknown arc 'dg'. Did you mean 'dig'"),
         ("episode.horizon", r"only numbers of nodes, arcs, services can be uncertain"),
         ("arcs.metal.share", r"'share' is not given"),
@@ -228,6 +232,8 @@ def uncertain_networks(draw: st.DrawFn) -> Network:
     network = draw(st.from_type(Network))
     paths = [f"arcs.{each.id}.{name}" for each in network.arcs for name in ("rate", "flow", "share")]
     paths += [f"nodes.{each.id}.{name}" for each in network.nodes for name in ("rate", "stretch")]
+    parts = [*(("nodes", each) for each in network.nodes), *(("arcs", each) for each in network.arcs)]
+    paths += [f"{kind}.{each.id}.control" for kind, each in parts if each.control is not None]
     paths += [f"services.{each.id}.{end}" for each in network.services for end in ("low", "high")]
     uncertain: Mapping[str, Spread] = {}
     for where in draw(st.lists(st.sampled_from(paths), unique=True, min_size=1, max_size=12)):
@@ -393,6 +399,128 @@ def test_no_draw_exceeds_what_arrays_are_made_for() -> None:
     (mine_,) = (i for i, node in enumerate(network.stores) if node.id == "mine")
     assert network.initial[0, mine_] == pytest.approx(10.0 * 5.0 * 4)
     np.testing.assert_array_equal(draw_network(network, factors[:, 7].tolist()).initial, network.initial)
+
+
+def collecting(spread: Spread, *, low: float = 0.2, high: float = 0.9, **more: Spread) -> Network:
+    """Return a collection whose share is set and uncertain, between a heap of discards and what is lost."""
+    share = Control(kind=ControlKind.SHARE, low=low, neutral=0.6, high=high)
+    return Network(
+        name="collecting",
+        nodes=(
+            Node(id="use", initial=(100.0, 100.0), rate=0.2),
+            Node(id="sorting", stores=False),
+            Node(id="tip", role=Role.LANDFILL, initial=(0.0, 0.0)),
+        ),
+        arcs=(
+            Arc(id="discarded", donor="use", recipient="sorting", law=Law.SHARE),
+            Arc(id="collected", donor="sorting", recipient="use", law=Law.SHARE, control=share),
+            Arc(id="lost", donor="sorting", recipient="tip", law=Law.SHARE, share=0.3),
+            Arc(id="burnt", donor="sorting", recipient="tip", law=Law.SHARE, share=0.1),
+        ),
+        episode=Episode(horizon=5),
+        uncertain={"arcs.collected.control": spread, **more},
+    )
+
+
+def test_a_lever_is_as_it_was_drawn() -> None:
+    """Actions span what was drawn, a share at most 1; the others keep their proportions; mass stays."""
+    network = collecting(Spread(low=0.5, high=1.5, distribution="uniform"))
+    env = MultiAgentVectorEnv(network, num_envs=50, uncertain=True, agents=["collected"])
+    for action, stated in ((-1.0, 0.2), (1.0, 0.9), (None, 0.6), (0.25, None)):
+        env.reset(seed=3)
+        factor = env.physical.factors[0]
+        low, high = (np.minimum(1.0, end * factor) for end in (0.2, 0.9))
+        expected = low + 0.625 * (high - low) if stated is None else np.minimum(1.0, stated * factor)
+        chosen = env.neutral_action if action is None else {"collected": np.full((50, 1), action)}
+        outcome = env.advance(env.stack(chosen))
+        np.testing.assert_allclose(env.controls[0], expected, rtol=1e-12)
+        discarded, collected, lost, burnt = outcome.flow
+        np.testing.assert_allclose(collected, expected * discarded, rtol=1e-9)
+        np.testing.assert_allclose(lost, 3 * burnt, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(env.physical.stock[:2].sum(axis=0), 100.0, rtol=1e-12)
+        for i, network_ in ((k, env.certain_network(k)) for k in (0, 7)):
+            control = network_.compartments["collected"].control
+            assert control is not None
+            assert (control.low, control.high) == pytest.approx((low[i], high[i]), rel=1e-12)
+    assert (factor > 1 / 0.9).any() and len(np.unique(factor)) == 50
+    env.reset(seed=3)
+    values = np.stack([0.5 * env.physical.factors[0]])
+    back = env.advance(env.stack({"collected": env.normalise("collected", values)}))
+    np.testing.assert_allclose(env.controls, values, rtol=1e-12)
+    assert (back.flow >= 0).all()
+
+
+def test_the_bound_of_a_draw_is_of_its_lever() -> None:
+    """No action does better than the draw's own bound, which the largest share comes up to."""
+    network = collecting(Spread(deviation=0.1), high=0.7)
+    env = MultiAgentVectorEnv(network, num_envs=4, uncertain=True)
+    run = rollout(env, Constant({"collected": 1.0}), seed=1)
+    for copy, reached in enumerate(run.episode_circularity):
+        limit = bound(env.certain_network(copy))
+        assert reached <= limit.objective + 1e-7
+        assert limit.gap(reached) < 0.02
+        assert limit.verify().bound == pytest.approx(limit.objective)
+    assert np.ptp(run.episode_circularity) > 0.01 * abs(run.episode_circularity.mean())
+
+
+@pytest.mark.parametrize(
+    ("spread", "said"),
+    [
+        (Spread(low=0.5, high=1.9, distribution="uniform"), r"some draws of its neutral shares sum to 1.14, more than"),
+        (Spread(low=1.1, high=1.2, distribution="uniform"), "does not contain the number itself"),
+    ],
+)
+def test_levers_that_cannot_be_drawn(spread: Spread, said: str) -> None:
+    """Neutral shares stay shares of a whole."""
+    with pytest.raises(NetworkError, match=said):
+        collecting(spread)
+
+
+def test_draws_of_a_lever_trap_no_mass() -> None:
+    """A loop without stock needs a way out whatever is drawn."""
+    network = collecting(Spread(low=0.9, high=1.05, distribution="uniform"))
+    nodes = tuple(
+        replace(node, stores=False, rate=0.0, initial=None) if node.id == "use" else node for node in network.nodes
+    )
+    source = Node(id="source", initial=(10.0, 10.0), rate=0.1)
+    arcs = (Arc(id="fed", donor="source", recipient="use", law=Law.SHARE), *network.arcs)
+    replace(network, nodes=(source, *nodes), arcs=arcs)
+    wide = {"arcs.collected.control": Spread(low=0.9, high=1.2, distribution="uniform")}
+    with pytest.raises(NetworkError, match="store nothing and can pass all they get round in a loop"):
+        replace(network, nodes=(source, *nodes), arcs=arcs, uncertain=wide)
+
+
+def test_files_state_how_levers_spread(tmp_path: Path) -> None:
+    """Deviation and range are of the neutral value; a share is at most 1; written files say the same."""
+    text = EXAMPLE.read_text().replace('kind = "share"', 'kind = "share", deviation = 0.1')
+    (tmp_path / "metal_cycle.csv").write_text(EXAMPLE.with_suffix(".csv").read_text())
+    (tmp_path / "levers.toml").write_text(text)
+    network = load_network(tmp_path / "levers.toml")
+    (path,) = (path for path in network.uncertain if path.endswith("control"))
+    assert network.uncertain[path].deviation == pytest.approx(0.2) and network.uncertain[path].high == pytest.approx(
+        2.0
+    )
+    write_network(network, tmp_path / "again.toml")
+    assert load_network(tmp_path / "again.toml").uncertain[path] == network.uncertain[path]
+    (tmp_path / "levers.toml").write_text(text.replace("deviation = 0.1", "range = [0.55, 0.7]"))
+    with pytest.raises(CirlError, match=r"arcs.old_scrap.control.range: \[0.55, 0.7\] must contain the number, 0.5"):
+        load_network(tmp_path / "levers.toml")
+
+
+def test_reserves_cover_what_levers_may_ask_for() -> None:
+    """A source without a known reserve starts with what the largest draw of its flow can take."""
+    control = Control(kind=ControlKind.FLOW, low=0.0, neutral=5.0, high=10.0)
+    network = Network(
+        name="digging",
+        nodes=(Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR), Node(id="store", initial=(0.0, 0.0))),
+        arcs=(Arc(id="dig", donor="mine", recipient="store", law=Law.CONTROLLED, control=control),),
+        episode=Episode(horizon=3),
+        uncertain={"arcs.dig.control": Spread(low=0.5, high=1.4, distribution="uniform")},
+    )
+    assert network.initial[0, 0] == pytest.approx(3 * 10 * 1.4, rel=1e-5)
+    env = MultiAgentVectorEnv(network, num_envs=20, uncertain=True)
+    rollout(env, Constant({"dig": 1.0}), seed=0)
+    np.testing.assert_allclose(env.physical.stock[1], 30.0 * env.physical.factors[0], rtol=1e-9)
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from decimal import Decimal
 from typing import Any
 
@@ -20,7 +21,7 @@ from cirl_marl.network import Network, elements
 from cirl_marl.network.declarations import Declaration, Numbers, Quantity, Subtable, declarations
 from cirl_marl.network.disturbances import KINDS, Correlation, DisturbanceEffect
 from cirl_marl.network.elements import LAW_FIELDS, Arc, Control, ControlKind, Law, Node
-from cirl_marl.network.series import Series, Value
+from cirl_marl.network.series import Series, Value, extremes
 from cirl_marl.network.uncertainty import Spread
 from cirl_marl.network.units import factor
 
@@ -249,7 +250,12 @@ class Converter:
             side: self._in_time(getattr(control, side), unit, f"{path}.{side}") for side in ("low", "neutral", "high")
         }
         self._disturb(control, control.unit, target or "1", f"{path}.high")
-        return Control(kind=control.kind, **sides)
+        result = Control(kind=control.kind, **sides)
+        self._spread(control, result.nominal, unit, path)
+        most = extremes(result.nominal)[1]
+        if control.kind is ControlKind.SHARE and control.range is None and path in self.uncertain and most > 0:
+            self.uncertain[path] = replace(self.uncertain[path], high=1 / most)  # no share is more than 1
+        return result
 
     def _number(self, quantity: Any, kind: str, path: str) -> float:
         """Return a quantity that does not change in time."""

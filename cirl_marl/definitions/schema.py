@@ -158,11 +158,22 @@ def _disturbance_table(kind: str) -> Any:
 
 
 FixedQuantity = number_forms(QuantityTable, None, ColumnTable)
-_CAPACITY = Field(None, description="name of a disturbance of its capacity, the value at action +1")
+_OF_CONTROL = {
+    "disturbed_by": "name of a disturbance of its capacity, the value at action +1",
+    "deviation": "standard deviation of its neutral value (of ``high`` where that is 0), in the same unit or relative; "
+    "what is drawn multiplies all three values",
+    "range": "lowest and highest neutral value that it may have; of a share at most 1",
+}
+_STATED = {
+    name: StatedTable.model_fields[name]
+    for name in ("disturbed_by", "disturbed_as", "deviation", "range", "distribution")
+}
 ControlTable = table_of(
     Control,
-    disturbed_by=(str | None, _CAPACITY),
-    disturbed_as=(StatedTable.model_fields["disturbed_as"].annotation, StatedTable.model_fields["disturbed_as"]),
+    **{
+        name: (stated.annotation, Field(None, description=_OF_CONTROL.get(name, stated.description)))
+        for name, stated in _STATED.items()
+    },
 )
 LifetimeTable = table_of(Lifetime)
 NodeTable = table_of(Node)

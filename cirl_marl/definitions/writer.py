@@ -155,6 +155,7 @@ class _Writer:
                 table[key] = write(part) if write else self._part(value)
                 if isinstance(value, Control):
                     table[key] |= self._disturbance_keys(f"{path}.{CAPACITY}")
+                    table[key] |= _spread_keys(self._network.uncertain.get(f"{path}.control"), value.nominal)
             elif isinstance(value, tuple):
                 table[key] = list(value)
             else:

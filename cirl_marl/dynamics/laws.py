@@ -22,7 +22,7 @@ from cirl_marl.dynamics.routing import Routing
 from cirl_marl.dynamics.shares import Shares
 from cirl_marl.dynamics.stages import StagedNetwork, simulated_network
 from cirl_marl.dynamics.state_layout import StateLayout
-from cirl_marl.dynamics.uncertain_factors import FlowFactors, IntervalFactors
+from cirl_marl.dynamics.uncertain_factors import ControlFactors, FlowFactors, IntervalFactors
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import positional_record
@@ -109,9 +109,11 @@ class ArcRates:
     def _bound_rates(self, draws: FlowFactors | None) -> None:
         """Bound what arcs carry and stocks drive with every control at its upper bound."""
         widest = single_column(self.control_high).max(axis=1, keepdims=True)
+        least = single_column(self.control_low).min(axis=1, keepdims=True)
         if draws is not None:
+            least, widest = draws.controls.extreme(least, 0), draws.controls.extreme(widest, 1)
             widest[draws.capacity.rows] *= draws.highest_capacity
-        widest[self._stretch_rows] = self.control_low[self._stretch_rows].min(axis=1, keepdims=True)
+        widest[self._stretch_rows] = least[self._stretch_rows]
         self.max_rate: Floats = self._rate_without_shares(widest)[:, 0]
         if len(self._series_arcs):
             self.max_rate[self._series_arcs] *= self._series.max(axis=1)
@@ -215,6 +217,7 @@ class FlowLaws(ArcRates):
         time_dependent: arcs whose r depends on the interval, by id.
         is_fixed: arcs whose r is the same in all copies and intervals, shape (arcs,).
         routing: what passes through nodes that store nothing.
+        control_factors: which controls are as they were drawn.
     """
 
     def __init__(self, network: Network, *, uncertain: bool = False) -> None:
@@ -223,6 +226,7 @@ class FlowLaws(ArcRates):
         self.factors = IntervalFactors(network, uncertain=uncertain)
         ranges = self.factors.ranges
         self._factors = FlowFactors(staged_network, ranges) if ranges else None
+        self.control_factors = ControlFactors(staged_network, ranges)
         super().__init__(staged_network, self._factors)
         self.network, rows, arcs = network, self.rows, len(staged_network.arcs)
         ends = np.concatenate([staged_network.donors, staged_network.recipients])
@@ -234,7 +238,7 @@ class FlowLaws(ArcRates):
         time_arcs = [*self._series_arcs, *(self._shares.varying_arcs if self._shares.is_time_varying else ())]
         self.time_dependent = tuple(staged_network.arcs[k].id for k in time_arcs)
         self._share_out()
-        self.routing = Routing(staged_network, self.rate(self.neutral[:, :1]), self.is_fixed)
+        self.routing = Routing(staged_network, self.rate(self.neutral[:, :1]), self.is_fixed, ranges)
 
     def _share_out(self) -> None:
         """Multiply constant shares into r, where no control comes before them, and find out which r never change."""
@@ -271,14 +275,14 @@ class FlowLaws(ArcRates):
 
     def neutral_in(self, step: Integers, factors: Floats | None = None) -> Floats:
         """Return the controls while nobody acts, in one interval of each copy, shape (controls, B)."""
-        neutral = _in_interval(self.neutral, step)
+        neutral = self.control_factors(_in_interval(self.neutral, step), factors)
         if factors is None or self._factors is None or not len(self._factors.capacity.rows):
             return neutral
         return np.minimum(neutral, self.capacity_in(step, factors))
 
     def capacity_in(self, step: Integers, factors: Floats | None) -> Floats:
         """Return the upper bounds of the controls, likewise."""
-        bounds = _in_interval(self.control_high, step)
+        bounds = self.control_factors(_in_interval(self.control_high, step), factors)
         return bounds if self._factors is None else self._factors.capacity(bounds, factors)
 
     def flow(self, stock: Floats, rate: Floats) -> Floats:

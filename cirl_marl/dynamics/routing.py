@@ -11,6 +11,7 @@ arcs and of the detours through constant nodes.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated
 
 import numpy as np
@@ -21,6 +22,7 @@ from cirl_marl.dynamics.static_elimination import SparseRow, StaticElimination, 
 from cirl_marl.dynamics.visit_bounds import VisitBounds
 from cirl_marl.network import Floats, Integers, Network, RowSum
 from cirl_marl.network.declarations import positional_record
+from cirl_marl.network.uncertainty import widest_splits
 
 
 @positional_record
@@ -45,15 +47,22 @@ class Routing:
         detours: the constant and the kept nodes.
     """
 
-    def __init__(self, network: Network, rate: Floats, arc_is_fixed: NDArray[np.bool_]) -> None:
+    def __init__(
+        self,
+        network: Network,
+        rate: Floats,
+        arc_is_fixed: NDArray[np.bool_],
+        ranges: Mapping[str, tuple[float, float]],
+    ) -> None:
         """Eliminate the constant nodes, and find the order of elimination of the others.
 
         Args:
             network: whose nodes they are.
             rate: rates of all arcs in one interval, shape (arcs, 1).
             arc_is_fixed: whether they are the same in all copies and intervals, shape (arcs,).
+            ranges: lowest and highest factors on uncertain numbers, by path.
         """
-        stores, self._network = len(network.stores), network
+        stores, self._network, self._ranges = len(network.stores), network, ranges
         self.nodes = len(network.nodes) - stores
         self.arcs: Integers = np.flatnonzero(network.donors >= stores)
         self.donors: Integers = network.donors[self.arcs] - stores
@@ -161,7 +170,7 @@ class Routing:
         Whatever the shares, what enters node j passes through nodes without stock at most v_j times in all
         (``passes``): no node sees more than that.
         """
-        passes = VisitBounds(self._network, self._network.splits)
+        passes = VisitBounds(self._network, widest_splits(self._network, self._ranges))
         total = np.max([passes.total(step) for step in passes.kinds], axis=0)
         # every unit that enters node i passes through nodes at most total_i times
         inflow = self._inflow_sum(flow[:, None])[self.places, 0]

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from cirl_marl.dynamics.uncertain_factors import RowFactors
+from cirl_marl.dynamics.uncertain_factors import ControlFactors, RowFactors
 from cirl_marl.network import Floats, Integers, Network, RowSum
 from cirl_marl.network.rowsum import single_column
 from cirl_marl.network.uncertainty import numbers_of
@@ -64,7 +64,12 @@ class Shares:
             return np.concatenate([np.empty((0, columns)), *(table[:, :columns] for table in tables)])
 
         self._low, neutral, high = (join_rows(split.bounds[side] for split in varying_splits) for side in range(3))
-        self._room = np.maximum(1.0 - self._total(self._low), 0.0)
+        self._room, widest_room = np.maximum(1.0 - self._total(self._low), 0.0), None
+        rows = self._rows
+        self._drawn = ControlFactors(network, ranges, rows)
+        if self._drawn.is_active:
+            high = self._drawn.extreme(high, 1)
+            widest_room = np.maximum(1.0 - self._total(self._drawn.extreme(self._low, 0)), 0.0)
         self._proportions = join_rows(split.proportions for split in varying_splits)
         stated_values = join_rows(split.stated_shares for split in varying_splits)
         self._rest, self._stated_shares = np.isnan(stated_values), np.where(np.isnan(stated_values), 0.0, stated_values)
@@ -77,7 +82,8 @@ class Shares:
         if number_of:
             ends = np.array([*ranges.values()]).T
             proportions = self._most(ends)
-        highest = np.concatenate([high, proportions * self._room[self._of_others]]).max(axis=1)
+        room = self._room if widest_room is None else widest_room
+        highest = np.concatenate([high, proportions * room[self._of_others]]).max(axis=1)
         self.highest = np.concatenate([highest, self.values[:, 0]])
 
     def __call__(self, controls: Floats, step: Integers | None, factors: Floats | None = None) -> Floats:
@@ -87,6 +93,9 @@ class Shares:
             # without a step the first interval stands for all
             interval = np.zeros(1, dtype=np.intp) if step is None else step
             low, room, proportions = (table.take(interval, axis=1) for table in (low, room, proportions))
+        if factors is not None and self._drawn.is_active:
+            low = self._drawn(low, factors)
+            room = np.maximum(1.0 - self._total(low), 0.0)
         if factors is not None and self._factors.rows.size:
             proportions = self._drawn_proportions(step, factors)
         shares = controls.take(self._rows, axis=0)

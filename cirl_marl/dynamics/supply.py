@@ -22,7 +22,7 @@ import numpy as np
 
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.dynamics.laws import FlowLaws
-from cirl_marl.dynamics.uncertain_factors import RowFactors
+from cirl_marl.dynamics.uncertain_factors import ControlFactors, RowFactors
 from cirl_marl.network import Floats, Integers, RowSum
 from cirl_marl.network.compartment_model import Bools
 from cirl_marl.network.elements import Service
@@ -70,6 +70,7 @@ class Supply:
         self._factors = RowFactors(
             {row: numbers[service_.id] for row, service_ in enumerate(services) if service_.id in numbers}
         )
+        self._drawn = ControlFactors(network, dynamics.factors.ranges, self._rows)
         stores, rows, columns = len(network.stores), [], []
         for row, service in enumerate(services):
             if service.quantity == "stock":
@@ -127,7 +128,7 @@ class Supply:
     ) -> Floats:
         """Return what ``__call__`` does, for copies so few that all they take stays in a cache."""
         batch, count = controls.shape[1], len(self._demand)
-        low = self._dynamics.control_low[self._rows].take(step, axis=1)
+        low = self._drawn(self._dynamics.control_low[self._rows].take(step, axis=1), factors)
         high = self._dynamics.capacity_in(step, factors)[self._rows]
         demand = self._factors(self._demand.take(step, axis=1), factors)
         most = np.zeros((count, batch))

@@ -12,7 +12,7 @@ import numpy as np
 
 from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.network.elements import Law
+from cirl_marl.network.elements import ControlKind, Law
 from cirl_marl.network.processes import interval_of
 from cirl_marl.network.uncertainty import CAPACITY, factor_ranges, numbers_of, stated_means
 
@@ -94,6 +94,39 @@ def capacity_numbers(network: Network, ranges: Mapping[str, tuple[float, float]]
     return {network.control_rows[id_].start: number for id_, number in numbers.items()}
 
 
+class ControlFactors:
+    """Controls of which uncertain numbers multiply the bounds and the neutral value; a share is at most 1."""
+
+    def __init__(
+        self, network: Network, ranges: Mapping[str, tuple[float, float]], rows: Integers | None = None
+    ) -> None:
+        """Take a table of ``rows`` of ``network.control_rows``, None being all; ``ranges`` are of all factors."""
+        number_of = {**numbers_of(ranges, "nodes", "control"), **numbers_of(ranges, "arcs", "control")}
+        owner = [id_ for id_ in network.controllable for _ in range(network.compartments[id_].actions)]
+        table_rows = range(len(owner)) if rows is None else rows.tolist()
+        numbers = {place: number_of[owner[row]] for place, row in enumerate(table_rows) if owner[row] in number_of}
+        controls = {place: network.compartments[owner[row]].control for place, row in enumerate(table_rows)}
+        is_share = [place for place in numbers if (c := controls[place]) and c.kind is ControlKind.SHARE]
+        self._factors, self._shares = RowFactors(numbers), np.array(is_share, dtype=np.intp)
+        self._ends = np.array([*ranges.values()], dtype=float).reshape(-1, 2).T
+
+    @property
+    def is_active(self) -> bool:
+        """Whether any of them is uncertain."""
+        return bool(len(self._factors.rows))
+
+    def __call__(self, table: Floats, factors: Floats | None) -> Floats:
+        """Return a table of controls, shape (rows, 1 or B), as they were drawn."""
+        drawn = self._factors(table, factors)
+        if drawn is not table and len(self._shares):
+            drawn[self._shares] = np.minimum(drawn[self._shares], 1.0)
+        return drawn
+
+    def extreme(self, table: Floats, end: int) -> Floats:
+        """Return a table of controls under the lowest (0) or the highest (1) factors."""
+        return self(table, np.repeat(self._ends[end][:, None], table.shape[1], axis=1))
+
+
 class FlowFactors:
     """The arcs whose flow laws uncertain numbers multiply; shares are not among them (``shares``).
 
@@ -102,10 +135,12 @@ class FlowFactors:
         highest: greatest factor on each, shape (arcs,).
         capacity: of controls whose upper bounds are disturbed.
         highest_capacity: greatest factor on each of these, shape (controls, 1).
+        controls: those that are uncertain.
     """
 
     def __init__(self, network: Network, ranges: Mapping[str, tuple[float, float]]) -> None:
         """Find them in ``network``, which has its lifetimes as stages if it has any; ``ranges`` are of all factors."""
+        self.controls = ControlFactors(network, ranges)
         valves = network.valves if isinstance(network, StagedNetwork) else {}
         rates, flows = numbers_of(ranges, "arcs", "rate"), numbers_of(ranges, "arcs", "flow")
         releases, stretches = numbers_of(ranges, "nodes", "rate"), numbers_of(ranges, "nodes", "stretch")

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import ArrayLike, NDArray
 
-from cirl_marl.dynamics.uncertain_factors import RowFactors, capacity_numbers
+from cirl_marl.dynamics.uncertain_factors import ControlFactors, RowFactors, capacity_numbers
 from cirl_marl.errors import CirlError, ControlError, unknown_name
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.rowsum import single_column, spans
@@ -38,7 +38,7 @@ class Actuators:
     ) -> None:
         """Let ``agents`` act, None being the network's own choice; a ``CirlError`` names one unknown or named twice.
 
-        ``ranges`` are those of the factors on what is disturbed, which ``step`` and others then bring.
+        ``ranges`` are those of the factors on what is uncertain or disturbed, which ``step`` and others then bring.
         """
         self.agents = _acting_agents(network, agents)
         self.num_envs = num_envs
@@ -48,6 +48,8 @@ class Actuators:
         self.control_rows: Integers = np.array(control_rows, dtype=np.intp)
         self.spaces = {a: Box(-1.0, 1.0, (span.stop - span.start,), np.float32) for a, span in rows.items()}
         self._all_act = control_rows == list(range(network.control_bounds.shape[1]))
+        self._drawn = ControlFactors(network, ranges, self.control_rows)
+        self._all_drawn = ControlFactors(network, ranges)
         low, neutral, high = (single_column(bound) for bound in network.control_bounds)
         capacities, highest = capacity_numbers(network, ranges), high
         self._all_capacities = RowFactors(capacities)
@@ -123,18 +125,19 @@ class Actuators:
     def _bounds_in(self, step: Integers, factors: Floats | None) -> Sequence[Floats]:
         """Return low, middle, half of the range and high of the agents' controls, shape (entries, B) each."""
         bounds = tuple(table.take(step, axis=1) for table in self._bounds) if self._vary_in_time else self._bounds
-        if factors is None or not len(self._capacities.rows):
+        if factors is None or not (len(self._capacities.rows) or self._drawn.is_active):
             return bounds
-        low, high = bounds[0], self._capacities(bounds[3], factors)
+        low, high = self._drawn(bounds[0], factors), self._capacities(self._drawn(bounds[3], factors), factors)
         return low, (high + low) / 2, (high - low) / 2, high
 
     def _neutral_in(self, step: Integers, factors: Floats | None) -> Floats:
         """Return the values of all controls while nobody acts, shape (controls, B): at most their capacity."""
         tables = self._neutral, self._highest
         neutral, highest = (table.take(step, axis=1) for table in tables) if self._vary_in_time else tables
+        neutral = self._all_drawn(neutral, factors)
         if factors is None or not len(self._all_capacities.rows):
             return neutral
-        return np.minimum(neutral, self._all_capacities(highest, factors))
+        return np.minimum(neutral, self._all_capacities(self._all_drawn(highest, factors), factors))
 
     def _wrong_agents(self, actions: Mapping[str, object]) -> str:
         for agent in actions:

@@ -29,7 +29,7 @@ from cirl_marl.network.declarations import (
     frozen_record,
 )
 from cirl_marl.network.lifetimes import SURVIVALS, Chain, chain_of
-from cirl_marl.network.series import Series, Value
+from cirl_marl.network.series import Series, Value, extremes
 
 
 class Role(StrEnum):
@@ -115,6 +115,11 @@ class Control(CheckedRecord):
     low: Annotated[Value, Amount("value at action −1, of each entry of the action")]
     neutral: Annotated[Value, Amount("value while nobody acts on the compartment")]
     high: Annotated[Value, Amount("value at action +1, of each entry of the action")]
+
+    @property
+    def nominal(self) -> Value:
+        """What its deviation is of: the neutral value or, where that is 0 at all times, the highest."""
+        return self.high if extremes(self.neutral) == (0.0, 0.0) else self.neutral
 
 
 FIXED_LIFETIME = "fixed"

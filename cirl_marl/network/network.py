@@ -152,7 +152,8 @@ class Network(Specification):
                 # a valve on the donor scales all its outflows, a control that sets a flow is of the controlled one
                 sets = [(f"arcs.{arc.id}", arc.control), (f"nodes.{donor.id}", donor.control)]
                 factors = [
-                    self.interval_means(control.high) * ranges.get(f"{path}.{CAPACITY}", CERTAIN)[1]
+                    self.interval_means(control.high)
+                    * math.prod(ranges.get(f"{path}.{name}", CERTAIN)[1] for name in ("control", CAPACITY))
                     for path, control in sets
                     if control is not None and (control.kind is ControlKind.RATE or arc.law is Law.CONTROLLED)
                 ]

@@ -12,11 +12,11 @@ from scipy import special
 
 from cirl_marl.errors import unknown_name
 from cirl_marl.network.declarations import CheckedRecord, Positive, Quantity, Word, declarations, frozen_record
-from cirl_marl.network.elements import FIXED_LIFETIME, Arc, ControlKind, Law, Node, Service
-from cirl_marl.network.rowsum import Floats
+from cirl_marl.network.elements import FIXED_LIFETIME, Arc, Control, ControlKind, Law, Node, Service
+from cirl_marl.network.rowsum import Floats, single_column
 from cirl_marl.network.series import Series, Value, extremes, in_intervals
 from cirl_marl.network.specification import Specification
-from cirl_marl.network.split_fractions import proportions, splits
+from cirl_marl.network.split_fractions import ROUNDING, Split, proportions, splits, trap_problems
 
 WIDE = 4.0
 """Deviations of a normal distribution up to which every distribution goes that states no range, by probability."""
@@ -139,10 +139,12 @@ def uncertainty_problems(network: Specification) -> Iterator[str]:
         except KeyError as error:
             yield f"{path}: {error.args[0]}"
             continue
-        mistakes = list(network.uncertain[path].problems()) if path in network.uncertain else []
-        if not mistakes and not all(map(math.isfinite, extremes(_number(part, name)))):
+        mistakes, number = [], _number(part, name)
+        if path in network.uncertain:
+            mistakes = list(network.uncertain[path].problems())
+        if not mistakes and not all(map(math.isfinite, extremes(number))):
             mistakes = ["it is infinite, and so is every draw; give the number"]
-        if not mistakes and extremes(_number(part, name)) == (0.0, 0.0):
+        if not mistakes and extremes(number) == (0.0, 0.0):
             mistakes = ["it is 0, and so is every draw; give the number"]
         if not mistakes and path in network.disturbed and network.disturbed[path].adds:
             if (stated_means(network, path) <= 0).any():
@@ -150,12 +152,38 @@ def uncertainty_problems(network: Specification) -> Iterator[str]:
         if not mistakes:
             mistakes = list(_undrawable(network, part, name, path))
         yield from (f"{path}: {mistake}" for mistake in mistakes)
+    if any(path.endswith(".control") for path in network.uncertain):
+        yield from _split_problems(network)
+
+
+def _split_problems(network: Specification) -> Iterator[str]:
+    """Yield donors whose shares some draws of their controls spoil."""
+    ranges = {path: spread.ends for path, spread in network.uncertain.items() if not list(spread.problems())}
+    highest = {id_: [*ranges.values()][row][1] for id_, row in numbers_of(ranges, "arcs", "control").items()}
+    divisions = splits(network)
+    if any(list(split.problems()) for split in divisions):
+        return  # which is told elsewhere
+    for split in divisions:
+        factors = np.array([[highest.get(network.arcs[k].id, 1.0)] for k in split.controlled_arcs])
+        most = float((split.bounds[1] * factors).sum(axis=0).max(initial=0.0)) if len(factors) else 0.0
+        if (factors != 1).any() and most > 1 + ROUNDING:
+            yield f"node '{split.donor}': some draws of its neutral shares sum to {most:.4g}, more than 1; give ranges"
+            return
+    yield from trap_problems(network, widest_splits(network, ranges))
 
 
 def _undrawable(network: Specification, part: Any, name: str, path: str) -> Iterator[str]:
     """Yield why no network could have some of the draws."""
     disturbed, low = network.disturbed.get(path), _factor_range(network, path)[0]
-    if name == "rate" and isinstance(part, Arc) and part.law is Law.BATCH:
+    if name == "control" and disturbed is not None:
+        yield f"'{disturbed.by}' can disturb '{CAPACITY}', not all of a control"
+    elif name == "control" and f"{path}.high" in network.disturbed:
+        yield "a control is uncertain or its capacity is disturbed, not both"
+    elif name == "control" and part.control.kind is ControlKind.INPUT:
+        yield "what is put into a model cannot be uncertain"
+    elif name == "control" and part.control.kind is ControlKind.STRETCH and low <= 0:
+        yield "some draws are 0; give a range above it"
+    elif name == "rate" and isinstance(part, Arc) and part.law is Law.BATCH:
         yield "the mass of what is released in batches cannot be uncertain"
     elif name == "stretch" and (part.lifetime is None or part.lifetime.distribution == FIXED_LIFETIME):
         yield f"only a lifetime with a deviation can be stretched{' or disturbed' if disturbed else ''}"
@@ -209,9 +237,9 @@ def _move_together(network: Specification, low: str, high: str) -> bool:
 def draw_network(network: Any, factors: Sequence[float] = (), path: Floats | None = None) -> Any:
     """Return the network whose numbers are certain: those that were uncertain, times what was drawn.
 
-    What is disturbed becomes a series. Shares of a donor stay shares of a whole: those that have no control keep their
-    proportions to each other, and an arc that takes the rest gets what they leave, if anything. Sources without a known
-    reserve keep that of ``network``.
+    What is disturbed becomes a series. Of a control low, neutral and high value are multiplied, a share up to 1.
+    Shares of a donor stay shares of a whole: those that have no control keep their proportions to each other, and an
+    arc that takes the rest gets what they leave, if anything. Sources without a known reserve keep that of ``network``.
 
     Args:
         network: with uncertain or disturbed numbers.
@@ -231,11 +259,13 @@ def draw_network(network: Any, factors: Sequence[float] = (), path: Floats | Non
     drawn = dict(zip(network.uncertain, factors, strict=True)) if len(factors) else {}
     for number, factor in drawn.items():
         part, name = _uncertain_field(network, number)
-        value = getattr(part, name)
-        if isinstance(value, Series):
-            change(part, name, replace(value, values=tuple(part_ * float(factor) for part_ in value.values)))
+        if name == "control":
+            most = 1.0 if part.control.kind is ControlKind.SHARE else math.inf
+            sides = {side: getattr(part.control, side) for side in ("low", "neutral", "high")}
+            drawn_sides = {side: _times(network, value, float(factor), most) for side, value in sides.items()}
+            change(part, name, replace(part.control, **drawn_sides))
         else:
-            change(part, name, value * float(factor))
+            change(part, name, _times(network, getattr(part, name), float(factor)))
     for number, disturbed in network.disturbed.items():
         assert path is not None
         (part, name), stated = _uncertain_field(network, number), stated_means(network, number)
@@ -244,12 +274,15 @@ def draw_network(network: Any, factors: Sequence[float] = (), path: Floats | Non
         course = value + disturbed.scale * course if disturbed.adds else value * course
         change(part, name, in_intervals(course, interval))
     for split in splits(network):
-        arcs = [network.arcs[k] for k in split.other_arcs]
+        arcs, controlled = ([network.arcs[k] for k in part] for part in (split.other_arcs, split.controlled_arcs))
         shares_ = [changes.get(id(arc), (arc, {}))[1].get("share", arc.share) for arc in arcs]
-        if any(value is not arc.share for value, arc in zip(shares_, arcs, strict=True)):
+        controls = [changes.get(id(arc), (arc, {}))[1].get("control", arc.control) for arc in controlled]
+        before = [*(arc.share for arc in arcs), *(arc.control for arc in controlled)]
+        if any(value is not old for value, old in zip([*shares_, *controls], before, strict=True)):
             drawn_shares = np.array([network.interval_means(np.nan if value is None else value) for value in shares_])
             remainder = 1.0 - split.bounds[1].sum(axis=0)
-            for arc, shares in zip(arcs, proportions(drawn_shares, remainder) * remainder, strict=True):
+            left = 1.0 - sum((network.interval_means(control.neutral) for control in controls), 0.0 * remainder)
+            for arc, shares in zip(arcs, proportions(drawn_shares, remainder) * left, strict=True):
                 if arc.share is not None:
                     change(arc, "share", in_intervals(shares, interval))
     initial: dict[str, Any] = dict(zip((node.id for node in network.stores), network.initial.T.tolist(), strict=True))
@@ -263,6 +296,31 @@ def draw_network(network: Any, factors: Sequence[float] = (), path: Floats | Non
     groups = {key: tuple(map(with_draws, getattr(network, key))) for key in KINDS}
     certain: dict[str, Any] = {"uncertain": {}, "disturbances": {}, "disturbed": {}, "correlation": None}
     return replace(network, **groups, **certain, scenarios={})
+
+
+def _times(network: Specification, value: Value, factor: float, most: float = math.inf) -> Value:
+    """Return a number times ``factor``, at most ``most`` in each control interval."""
+    if not isinstance(value, Series):
+        return min(value * factor, most)
+    if extremes(value)[1] * factor > most:
+        means = np.minimum(network.interval_means(value) * factor, most)
+        return in_intervals(means, network.episode.control_interval)
+    return replace(value, values=tuple(part * factor for part in value.values))
+
+
+def widest_splits(network: Specification, ranges: Mapping[str, tuple[float, float]]) -> list[Split]:
+    """Return the splits of a network, with shares that controls set as low and as high as they can be drawn."""
+    numbers, ends = numbers_of(ranges, "arcs", "control"), [*ranges.values()]
+    divisions = []
+    for split in splits(network):
+        ids = [network.arcs[k].id for k in split.controlled_arcs]
+        if numbers.keys() & set(ids):
+            drawn = [ends[numbers[id_]] if id_ in numbers else CERTAIN for id_ in ids]
+            low, high = np.array(drawn, dtype=float).T[..., None]
+            bounds = single_column(split.bounds) * np.stack([low, np.ones_like(low), high])
+            split = replace(split, bounds=np.broadcast_to(np.minimum(bounds, 1.0), split.bounds.shape))
+        divisions.append(split)
+    return divisions
 
 
 def expected_network(network: Any, states: Floats | None = None, step: int = 0) -> Any:
@@ -301,7 +359,8 @@ def _uncertain_field(network: Specification, path: str) -> tuple[Any, str]:
         for field, declaration in fields.items()
         if isinstance(declaration, Quantity) and declaration.varies and not declaration.past
     ]
-    options += [CAPACITY] * ("control" in fields)
+    if "control" in fields:
+        options += ["control", CAPACITY]
     if name not in options:
         raise KeyError(f"of {kind} these can be uncertain or disturbed: {', '.join(options)}; '{name}' cannot")
     if name == CAPACITY and parts[id_].control is None:
@@ -312,9 +371,10 @@ def _uncertain_field(network: Specification, path: str) -> tuple[Any, str]:
 
 
 def _number(part: Any, name: str) -> Value:
-    """Return the number that a field of a part is, or the upper bound of its control."""
-    value: Value = part.control.high if name == CAPACITY else getattr(part, name)
-    return value
+    """Return the number that is uncertain or disturbed; of a control what its deviation is of, or its upper bound."""
+    value = part.control.high if name == CAPACITY else getattr(part, name)
+    number: Value = value.nominal if isinstance(value, Control) else value
+    return number
 
 
 def _split(path: str) -> tuple[str, str, str]:
