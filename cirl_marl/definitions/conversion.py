@@ -339,7 +339,7 @@ class Converter:
             if str(error) not in self._file_errors or isinstance(entry, AmountSeries):
                 self.mistakes.append(f"{path}: {error}")
             self._file_errors.add(str(error))  # a file that cannot be read is told once, not for each of its columns
-            return 0.0
+            return math.nan
         self.data_files.add(entry.file)
         return column
 

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import csv
+import gc
 import hashlib
 import io
+import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
@@ -14,12 +18,17 @@ from typing import Any, TypeVar
 
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network.calendar import YearOrDate
+from cirl_marl.records.files import LARGEST, read_content
 
 T = TypeVar("T")
 Line = tuple[int, list[str]]
 """A row of a table, with the number of the line on which it ends."""
-LARGEST = 200_000_000
-"""Bytes of the largest file that is read."""
+Block = tuple[Sequence[int], list[list[str]]]
+"""Rows of a table, with the numbers of the lines on which they end."""
+BLOCK = 512
+"""Rows of a block."""
+BREAK = re.compile("\r\n?|\n")
+"""What ends a line, inside of a cell too."""
 YEAR = "year"
 """The column of times, if a file has one of this name and nothing else is said."""
 
@@ -33,14 +42,41 @@ class Column:
     origin: str
 
 
-def csv_lines(subject: str, content: bytes) -> list[Line]:
-    """Return the lines of a CSV file that are not empty."""
+@contextmanager
+def no_collection() -> Iterator[None]:
+    """Read without looking for garbage meanwhile: of a million rows none is part of a cycle, and looking takes long."""
+    was_enabled = gc.isenabled()
+    gc.disable()
     try:
-        reader = csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
-        # csv counts the line on which a row ends
-        return [(reader.line_num, row) for row in reader if row]
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
+
+
+def csv_blocks(subject: str, content: bytes) -> Iterator[Block]:
+    """Yield the rows of a CSV file that are not empty, some thousands at a time; a ``CirlError`` if it is none."""
+    reader = csv.reader(io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline=""), strict=True)
+    line = 0
+    try:
+        while rows := list(itertools.islice(reader, BLOCK)):
+            lines: Sequence[int] = range(line + 1, reader.line_num + 1)
+            line = reader.line_num
+            if len(lines) > len(rows):
+                ends = itertools.accumulate(1 + sum(len(BREAK.findall(cell)) for cell in row) for row in rows)
+                lines = [lines[end - 1] for end in ends]
+            if [] in rows:
+                lines = [number for number, row in zip(lines, rows, strict=True) if row]
+                rows = [row for row in rows if row]
+            yield lines, rows
     except (UnicodeDecodeError, csv.Error) as error:
         raise CirlError(f"{subject}: is no CSV file in UTF-8: {error}") from error
+
+
+def csv_lines(subject: str, content: bytes) -> list[Line]:
+    """Return the lines of a CSV file that are not empty; a ``CirlError`` if it is none."""
+    with no_collection():
+        return [line for lines, rows in csv_blocks(subject, content) for line in zip(lines, rows, strict=True)]
 
 
 def even_lines(subject: str, lines: list[Line]) -> list[Line]:
@@ -97,7 +133,7 @@ class DataFiles:
             CirlError: naming the file and what is wrong with it.
         """
         path = self._with_file_errors(name, self._path_of)
-        self._plain_files[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        self._plain_files[name] = hashlib.sha256(read_content(path)).hexdigest()
         return path
 
     def column(self, name: str, column: str, conditions: Mapping[str, str], times: str | None) -> Column:
@@ -124,7 +160,7 @@ class DataFiles:
 
     def _read(self, name: str) -> _Table:
         if name not in self._tables:
-            self._tables[name] = _Table(name, self._path_of(name).read_bytes())
+            self._tables[name] = _Table(name, read_content(self._path_of(name)))
         return self._tables[name]
 
     def _path_of(self, name: str) -> Path:

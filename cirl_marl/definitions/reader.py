@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import difflib
 import hashlib
+import math
 import re
 import tomllib
 from collections.abc import Iterator, Mapping
@@ -22,7 +23,7 @@ from cirl_marl.definitions.region_copies import compose_copies, copied_file
 from cirl_marl.definitions.schema import NetworkTable
 from cirl_marl.errors import CirlError, DefinitionError, NetworkError, unknown_name
 from cirl_marl.network import Network
-from cirl_marl.records.files import write_atomically
+from cirl_marl.records.files import read_content, write_atomically
 
 DEFAULT = "default"
 """The scenario that stands outside ``[scenarios]``."""
@@ -52,7 +53,7 @@ class Definition:
         """
         self.path, self.files = path, DataFiles(path.parent)
         self._document = read_toml(path)
-        self.sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+        self.sha256 = hashlib.sha256(read_content(path)).hexdigest()
         overrides = self._document.get("scenarios", {})
         if not isinstance(overrides, dict) or not all(isinstance(scenario, dict) for scenario in overrides.values()):
             raise DefinitionError(str(path), ["scenarios: must be tables, as in [scenarios.paper]"])
@@ -180,7 +181,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > LARGEST:
             raise DefinitionError(str(path), [f"has more than {LARGEST >> 20} MiB; keep long tables in CSV files"])
-        text = path.read_text(encoding="utf-8")
+        text = read_content(path).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
     except FileNotFoundError:
         raise DefinitionError(str(path), ["no such file"]) from None
     except (OSError, UnicodeDecodeError) as error:
@@ -212,7 +213,7 @@ def _impossible(document: Mapping[str, Any]) -> Iterator[str]:
             parts = value.items() if isinstance(value, dict) else enumerate(value)
             entries += [(f"{path}.{key}".lstrip("."), depth + 1, entry) for key, entry in parts]
         elif isinstance(value, int) and not -(2**63) <= value < 2**63:
-            yield f"{path}: is an integer of {len(str(value))} digits; {DIGITS}"
+            yield f"{path}: is an integer of some {math.ceil(value.bit_length() * math.log10(2))} digits; {DIGITS}"
 
 
 def _strangers(document: Mapping[str, Any], override: Mapping[str, Any], prefix: str) -> Iterator[str]:

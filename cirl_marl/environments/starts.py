@@ -214,6 +214,9 @@ def _wholes(network: Network) -> dict[str, tuple[str, ...]]:
 
 def _numbers(label: str, values: ArrayLike) -> Floats:
     try:
-        return np.asarray(values, dtype=float)
-    except (TypeError, ValueError):
+        array = np.asarray(values)
+        if array.dtype.kind not in "iuf" or np.ma.is_masked(values):
+            raise ValueError("no numbers")
+        return array.astype(float)
+    except (TypeError, ValueError, RuntimeError):  # RuntimeError: of a tensor that requires a gradient
         raise ControlError(f"{label} is {values!r}; it must hold numbers") from None

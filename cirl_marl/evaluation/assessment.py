@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from cirl_marl.evaluation.comparison import Comparison, compare
 from cirl_marl.evaluation.figures import summary
 from cirl_marl.evaluation.statistics import over_episodes
 from cirl_marl.learners.run_directory import RunDirectory
-from cirl_marl.records.files import write_json
+from cirl_marl.records.files import read_record, write_json
 
 CONTROLLERS = ("neutral", "random")
 """Whom a run is compared with."""
@@ -74,9 +73,9 @@ class Evaluation:
 
     def _is_kept(self, path: Path) -> bool:
         try:
-            content = json.loads(path.read_text()) if path.is_file() else {}
-        except ValueError as error:
-            raise RunError(f"{path}: cannot be read: {error}; delete it to evaluate anew") from error
+            content = read_record(path) if path.is_file() else {}
+        except RunError as error:
+            raise RunError(f"{error}; delete it to evaluate anew") from error
         return all(content.get(name) == self.figures[name] for name in ("checkpoint", "episodes", "first_seed"))
 
 

@@ -2,31 +2,21 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+import itertools
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Annotated, NamedTuple
-from zipfile import BadZipFile
 
-from cirl_marl.definitions.data_files import Line, csv_lines, even_lines, number_in
+from cirl_marl.definitions.data_files import no_collection, number_in
 from cirl_marl.errors import CirlError, unknown_name
+from cirl_marl.importing.grids import Grid, GridPart, Memo, is_year, read_grids
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.units import factor
 
-NAMES: Mapping[str, tuple[str, ...]] = {
-    "source": ("source", "from", "origin"),
-    "target": ("target", "to", "destination"),
-    "year": ("year", "time"),
-    "value": ("value", "flow", "amount", "mass"),
-    "unit": ("unit", "units"),
-    "type": ("type", "good", "material"),
-    "region": ("region", "country"),
-    "uncertainty": ("uncertainty", "deviation"),
-    "process": ("process", "node", "stock of"),
-}
-"""What columns may be called, whatever the case."""
-WORKBOOKS = (".xlsx", ".xlsm")
+LAST_YEAR = 9999
 
 
 class Connection(NamedTuple):
@@ -41,14 +31,18 @@ class Connection(NamedTuple):
         return f"'{self.source}' to '{self.target}'" + (f", {self.type}" if self.type else "")
 
 
+Key = tuple[str, int, Connection]
+"""Region, empty where there are none, year, and what the flow is."""
+
+
 @positional_record
 class FlowTable:
     """Flows by region, year and pair; what is not in ``flows`` is 0."""
 
     name: Annotated[str, "the file"]
     unit: Annotated[str, "mass/time"]
-    flows: Annotated[Mapping[tuple[str, int, Connection], float], "by region (empty without regions), year and pair"]
-    deviations: Annotated[Mapping[tuple[str, int, Connection], float], "standard deviations, of those that state one"]
+    flows: Annotated[Mapping[Key, float], "by region (empty without regions), year and pair"]
+    deviations: Annotated[Mapping[Key, float], "standard deviations, of those that state one"]
 
     @property
     def regions(self) -> tuple[str, ...]:
@@ -73,59 +67,10 @@ class FlowTable:
             CirlError: for one that is not there; names the nearest.
         """
         for region in regions:
-            if region not in self.regions:
-                raise CirlError(f"{self.name}: {unknown_name('region', region, self.regions)}")
+            if region not in (present := self.regions):
+                raise CirlError(f"{self.name}: {unknown_name('region', region, present)}")
         selection = {key: value for key, value in self.flows.items() if key[0] in regions}
         return replace(self, flows=selection)
-
-
-@dataclass(slots=True)
-class _Grid:
-    """The cells of a file or a sheet, as texts, with the line of each row."""
-
-    name: str
-    header: list[str]
-    rows: list[Line]
-    places: dict[str, int] = field(init=False)
-    years: dict[str, int] = field(init=False, default_factory=dict)
-
-    def __post_init__(self) -> None:
-        plain = [title.strip().lower() for title in self.header]
-        self.places = {}
-        for key, names in NAMES.items():
-            columns = [i for i, title in enumerate(plain) if title in names]
-            if len(columns) > 1:
-                titles = " and ".join(f"'{self.header[i]}'" for i in columns[:2])
-                raise CirlError(f"{self.name}, line 1: {titles} both mean {key}; rename one")
-            if columns:
-                self.places[key] = columns[0]
-
-    def at(self, row: Sequence[str], key: str) -> str:
-        """Return a cell; nothing if there is no such column."""
-        return row[self.places[key]].strip() if key in self.places else ""
-
-    def number(self, line: int, text: str, column: str, *, least: float = 0.0) -> float:
-        """Return a number of a cell.
-
-        Raises:
-            CirlError: naming file, line, column and text, if it is none or below ``least``.
-        """
-        value = number_in(text)
-        if least <= value < math.inf:
-            return value
-        label = f"{self.name}, line {line}, column '{column}'"
-        if not math.isfinite(value):
-            raise CirlError(f"{label}: '{text}' is no number; write one as in 1234.5, or leave out the row")
-        hint = "; a flow runs from source to target: swap them" if least == 0.0 else ""
-        raise CirlError(f"{label}: {text} is negative{hint}")
-
-    def year(self, line: int, text: str) -> int:
-        if text not in self.years:
-            value = self.number(line, text, self.header[self.places["year"]], least=-math.inf)
-            if value != round(value):
-                raise CirlError(f"{self.name}, line {line}: '{text}' is no whole year")
-            self.years[text] = int(value)
-        return self.years[text]
 
 
 def read_flows(path: Path, *, sheet: str | None = None, unit: str | None = None, year: int | None = None) -> FlowTable:
@@ -145,30 +90,44 @@ def read_flows(path: Path, *, sheet: str | None = None, unit: str | None = None,
     Raises:
         CirlError: naming file, line, column and value, with what to do.
     """
-    grids = list(_grids(path, sheet))
-    flows: dict[tuple[str, int, Connection], float] = {}
-    lines: dict[tuple[str, int, Connection], int] = {}
-    deviations: dict[tuple[str, int, Connection], float] = {}
+    with no_collection():
+        return _read_flows(path, sheet, unit, year)
+
+
+def _read_flows(path: Path, sheet: str | None, default_unit: str | None, default_year: int | None) -> FlowTable:
+    flows: dict[Key, float] = {}
+    keys: list[Key] = []
+    places: list[tuple[str, Sequence[int]]] = []
+    deviations: dict[Key, float] = {}
     units: dict[str, str] = {}
-    for grid in grids:
+    present: dict[tuple[str, int], None] = {}
+    for grid in read_grids(path, sheet):
         long = {"source", "target"} <= grid.places.keys()
-        for line, key, value, unit_of_row, deviation in _long(grid, year) if long else _matrix(grid, year):
-            if key in flows:
-                flow_text = f"{key[2]} in {key[1]}{f' in {key[0]}' if key[0] else ''}"
-                fault = f"{flow_text} stands in line {lines[key]} too; leave one out, or give them types"
-                raise CirlError(f"{grid.name}, line {line}: {fault}")
-            if key[2].source == key[2].target:
-                raise CirlError(f"{grid.name}, line {line}: {key[2]}: a flow needs two processes")
-            flows[key], lines[key] = value, line
-            if unit_of_row not in units:
-                units[unit_of_row] = f"{grid.name}, line {line}"
-            if deviation is not None:
-                deviations[key] = deviation
+        for entries in _long(grid, default_year) if long else _matrix(grid, default_year):
+            flows.update(zip(entries.keys, entries.values, strict=True))
+            keys += entries.keys
+            present |= dict.fromkeys(map(itemgetter(0, 1), entries.keys))
+            places.append((grid.name, entries.lines))
+            deviations |= entries.deviations
+            for unit_of_row, line in entries.units.items():
+                units.setdefault(unit_of_row, f"{grid.name}, line {line}")
+            if len(flows) < len(keys):
+                raise CirlError(_repeated(keys, places))
     if not flows:
         raise CirlError(f"{path}: has no flows")
-    table = FlowTable(path.name, _unit(path, units, unit), flows, deviations)
-    _check_years(table)
-    return table
+    _check_years(path.name, present)
+    return FlowTable(path.name, _unit(path, units, default_unit), flows, deviations)
+
+
+def _repeated(keys: Sequence[Key], places: Sequence[tuple[str, Sequence[int]]]) -> str:
+    """Say which flow stands in a table twice."""
+    line_of: dict[Key, int] = {}
+    positions = ((name, line) for name, lines in places for line in lines)
+    for (region, year, pair), (name, line) in zip(keys, positions, strict=True):
+        if (earlier := line_of.setdefault((region, year, pair), line)) != line:
+            flow = f"{pair} in {year}{f' in {region}' if region else ''}"
+            return f"{name}, line {line}: {flow} stands in line {earlier} too; leave one out, or give them types"
+    raise AssertionError("no flow stands there twice")
 
 
 def read_stocks(path: Path, unit: str) -> dict[tuple[str, str, int], float]:
@@ -180,22 +139,37 @@ def read_stocks(path: Path, unit: str) -> dict[tuple[str, str, int], float]:
         CirlError: naming file, line, column and value, with what to do.
     """
     stocks: dict[tuple[str, str, int], float] = {}
-    for grid in _grids(path, None):
-        _needs(grid, ("process", "year", "value", "unit"))
-        for line, row in grid.rows:
-            key = (grid.at(row, "region"), grid.at(row, "process"), grid.year(line, grid.at(row, "year")))
-            if key in stocks:
-                raise CirlError(f"{grid.name}, line {line}: a stock of '{key[1]}' in {key[2]} stands there already")
-            value = grid.number(line, grid.at(row, "value"), grid.header[grid.places["value"]])
-            stocks[key] = value * _factor(f"{grid.name}, line {line}", grid.at(row, "unit"), unit)
+    for grid in read_grids(path, None):
+        grid.require(("process", "year", "value", "unit"))
+        factors = Memo[str, float](lambda text: factor(text.strip(), unit))
+        for part in grid.parts():
+            years = part.converted(part.of("year"), Memo(_year))
+            values, scales = (
+                part.numbers(grid.places["value"], part.of("value")),
+                part.converted(part.of("unit"), factors),
+            )
+            cells = zip(part.of("region"), part.of("process"), years, part.lines, values, scales, strict=True)
+            for region, process, year, line, value, scale in cells:
+                key = region.strip(), process.strip(), year
+                if key in stocks:
+                    raise CirlError(f"{grid.name}, line {line}: a stock of '{key[1]}' in {year} stands there already")
+                stocks[key] = value * scale
     return stocks
 
 
-_Entry = tuple[int, tuple[str, int, Connection], float, str, float | None]
+@dataclass(frozen=True, slots=True)
+class _Entries:
+    """Flows of some rows: their lines, keys and values, the first line of each unit, and deviations that are stated."""
+
+    lines: Sequence[int]
+    keys: list[Key]
+    values: list[float]
+    units: Mapping[str, int]
+    deviations: Mapping[Key, float]
 
 
-def _long(grid: _Grid, default_year: int | None) -> Iterator[_Entry]:
-    """Yield line, key, value, unit and deviation of each row of a long table."""
+def _long(grid: Grid, default_year: int | None) -> Iterator[_Entries]:
+    """Yield the flows of a long table."""
     unit = ""
     if "value" not in grid.places:
         used_columns = set(grid.places.values())
@@ -207,53 +181,78 @@ def _long(grid: _Grid, default_year: int | None) -> Iterator[_Entry]:
         grid.places["value"] = unit_columns[0]
         unit = grid.header[unit_columns[0]].strip().lower().replace("_per_", "/")
     if default_year is None:
-        _needs(grid, ("year",))
-    columns = [grid.places.get(key) for key in ("source", "target", "type", "region", "year", "value")]
-    for line, row in grid.rows:
-        cells = ["" if column is None else row[column].strip() for column in columns]
-        source, target, type_, region, year_text, value_text = cells
-        pair = Connection(source, target, type_)
-        if not pair.source or not pair.target:
-            raise CirlError(f"{grid.name}, line {line}: a flow needs a source and a target")
-        year = default_year if columns[4] is None else grid.year(line, year_text)
-        assert year is not None
-        value = grid.number(line, value_text, grid.header[grid.places["value"]])
-        deviation = None
-        if uncertainty := grid.at(row, "uncertainty"):
-            column = grid.header[grid.places["uncertainty"]]
-            relative = uncertainty.endswith("%")
-            deviation = grid.number(line, uncertainty.rstrip("% "), column) * (value / 100 if relative else 1.0)
-        yield line, (region, year, pair), value, unit or grid.at(row, "unit"), deviation
+        grid.require(("year",))
+    ends = itemgetter(*(grid.places[key] for key in ("source", "target", "type") if key in grid.places))
+    pairs, years, regions = Memo(_connection), Memo(_year), Memo[str, str](str.strip)
+    for part in grid.parts():
+        year_of_row: Iterable[int] = itertools.repeat(default_year or 0, len(part.rows))
+        if "year" in grid.places:
+            year_of_row = part.converted(part.of("year"), years)
+        region_of_row = part.converted(part.of("region"), regions)
+        keys = list(zip(region_of_row, year_of_row, part.converted(list(map(ends, part.rows)), pairs), strict=True))
+        values = part.numbers(grid.places["value"], part.of("value"))
+        texts = part.of("unit")
+        units = {unit or text.strip(): part.lines[texts.index(text)] for text in dict.fromkeys(texts)}
+        yield _Entries(part.lines, keys, values, units, dict(_deviations(part, keys, values)))
 
 
-def _matrix(grid: _Grid, default_year: int | None) -> Iterator[_Entry]:
-    """Yield line, key, value, no unit and no deviation of each cell of a matrix of processes."""
+def _connection(cells: tuple[str, ...]) -> Connection:
+    """Return the flow that the cells of a row name."""
+    pair = Connection(*map(str.strip, cells))
+    if not pair.source or not pair.target:
+        raise CirlError("a flow needs a source and a target")
+    if pair.source == pair.target:
+        raise CirlError(f"{pair}: a flow needs two processes")
+    return pair
+
+
+def _year(text: str) -> int:
+    """Return the year that a cell says."""
+    value = number_in(text)
+    if not (1 <= value <= LAST_YEAR and value == round(value)):
+        raise CirlError(f"'{text.strip()}' is no whole year")
+    return int(value)
+
+
+def _deviations(part: GridPart, keys: Sequence[Key], values: Sequence[float]) -> Iterator[tuple[Key, float]]:
+    """Yield the standard deviations that rows state, by their keys."""
+    column = part.grid.places.get("uncertainty")
+    if column is not None:
+        texts = [row[column].strip() for row in part.rows]
+        stated = [i for i, text in enumerate(texts) if text]
+        rows = GridPart(part.grid, [part.lines[i] for i in stated], [part.rows[i] for i in stated])
+        deviations = rows.numbers(column, [texts[i].rstrip("% ") for i in stated])
+        for i, deviation in zip(stated, deviations, strict=True):
+            yield keys[i], deviation * (values[i] / 100 if texts[i].endswith("%") else 1.0)
+
+
+def _matrix(grid: Grid, default_year: int | None) -> Iterator[_Entries]:
+    """Yield the flows of a matrix of processes, which state no unit and no deviation."""
     sheet_name = grid.name.rpartition(", sheet '")[2].rstrip("'")
-    year = int(sheet_name) if _is_year(sheet_name) else default_year
+    year = int(sheet_name) if is_year(sheet_name) else default_year
     if year is None:
         raise CirlError(
             f"{grid.name}: is a matrix of processes, as it has no columns 'source' and 'target'; of which year? Give "
             "--year, or name its sheet by it"
         )
     targets = [title.strip() for title in grid.header[1:]]
-    for target in targets:
-        if not target or targets.count(target) > 1:
+    for target, count in Counter(targets).items():
+        if not target or count > 1:
             problem = f"names '{target}' twice" if target else "has a column without a name"
             raise CirlError(f"{grid.name}, line 1: {problem}; each column is a process that receives")
-    for line, row in grid.rows:
-        source = row[0].strip()
-        for target, text in zip(targets, row[1:], strict=True):
-            if text.strip():
-                value = grid.number(line, text.strip(), target)
+    pairs = Memo(_connection)
+    for part in grid.parts():
+        columns = [[row[k].strip() or "0" for row in part.rows] for k in range(1, len(grid.header))]
+        numbers = [part.numbers(k, texts) for k, texts in enumerate(columns, 1)]
+        lines, ends, values = [], [], []
+        for line, row, row_values in zip(part.lines, part.rows, zip(*numbers, strict=True), strict=True):
+            for target, value in zip(targets, row_values, strict=True):
                 if value > 0:
-                    yield line, ("", year, Connection(source, target)), value, "", None
-
-
-def _needs(grid: _Grid, keys: Sequence[str]) -> None:
-    for key in keys:
-        if key not in grid.places:
-            need = f"column '{key}'; it has {', '.join(filter(None, grid.header)) or 'none'}"
-            raise CirlError(f"{grid.name}, line 1: needs a {need}. Separate columns with commas.")
+                    lines.append(line)
+                    ends.append((row[0], target))
+                    values.append(value)
+        keys = [("", year, pair) for pair in GridPart(grid, lines, part.rows).converted(ends, pairs)]
+        yield _Entries(lines, keys, values, {"": lines[0]} if lines else {}, {})
 
 
 def _unit(path: Path, units: Mapping[str, str], default_unit: str | None) -> str:
@@ -283,61 +282,13 @@ def _factor(place: str, unit: str, target: str) -> float:
         raise CirlError(f"{place}: {error}") from error
 
 
-def _check_years(table: FlowTable) -> None:
+def _check_years(name: str, present: Mapping[tuple[str, int], None]) -> None:
     """Refuse a region without any flow in a year between the first and the last."""
-    with_flows = {(region, year) for region, year, _ in table.flows}
-    for region in table.regions:
-        gaps = [year for year in table.years if (region, year) not in with_flows]
+    years = [year for _, year in present]
+    for region in dict.fromkeys(region for region, _ in present):
+        gaps = [year for year in range(min(years), max(years) + 1) if (region, year) not in present]
         if gaps:
             owner = f"region '{region}'" if region else "the table"
             listing = ", ".join(map(str, gaps[:5])) + (", …" if len(gaps) > 5 else "")
             remedy = "a flow that is not in the table is 0, but a year without any is missing. Add it, or leave it out"
-            raise CirlError(f"{table.name}: {owner} has no flow in {listing}: {remedy} everywhere")
-
-
-def _grids(path: Path, sheet: str | None) -> Iterator[_Grid]:
-    """Yield the tables of a file."""
-    if not path.is_file():
-        raise CirlError(f"{path}: no such file")
-    if path.suffix.lower() in WORKBOOKS:
-        yield from _sheets(path, sheet)
-        return
-    if sheet is not None:
-        raise CirlError(f"{path}: is no workbook, so that it has no sheet '{sheet}'")
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise CirlError(f"{path}: cannot be read: {error}") from error
-    yield _grid(path.name, csv_lines(str(path), content))
-
-
-def _sheets(path: Path, sheet: str | None) -> Iterator[_Grid]:
-    try:
-        from openpyxl import load_workbook
-        from openpyxl.utils.exceptions import InvalidFileException
-    except ImportError:
-        raise CirlError(f"{path}: to read workbooks: pip install 'cirl-marl[excel]', or save it as CSV") from None
-    try:
-        book = load_workbook(path, read_only=True, data_only=True)
-    except (OSError, InvalidFileException, BadZipFile, KeyError, ValueError) as error:
-        raise CirlError(f"{path}: is no workbook that can be read: {error}") from error
-    try:
-        if sheet is not None and sheet not in book.sheetnames:
-            raise CirlError(f"{path}: {unknown_name('sheet', sheet, book.sheetnames)}")
-        years = [text for text in book.sheetnames if _is_year(text)]
-        for name in [sheet] if sheet is not None else years or book.sheetnames[:1]:
-            rows = enumerate(book[name].iter_rows(values_only=True), start=1)
-            texts = [(line, ["" if cell is None else str(cell) for cell in row]) for line, row in rows]
-            yield _grid(f"{path.name}, sheet '{name}'", texts)
-    finally:
-        book.close()
-
-
-def _grid(name: str, lines: Sequence[Line]) -> _Grid:
-    """Return the table of a file or a sheet, without lines of blanks."""
-    (_, header), *rows = even_lines(name, [line for line in lines if any(cell.strip() for cell in line[1])])
-    return _Grid(name, header, rows)
-
-
-def _is_year(text: str) -> bool:
-    return len(text) == 4 and text.isdigit()
+            raise CirlError(f"{name}: {owner} has no flow in {listing}: {remedy} everywhere")

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from cirl_marl.errors import CirlError, RunError
-from cirl_marl.jobs.work import EXIT_STOPPED, Work, text_lines
+from cirl_marl.jobs.work import EXIT_STOPPED, Work, last_line, text_lines
 
 MINUTES = 24 * 60
 """Longest that a job may take unless something else is asked for; what is cut off goes on in another one."""
@@ -106,7 +106,7 @@ class SlurmJob:
             return None
         self._queue.forget(self._number)
         out = self._file.with_suffix(".out")
-        words = text_lines(out.read_text(errors="replace"))[-1:] if out.is_file() else []
+        words = last_line(out)
         for file in (self._file, out):
             file.unlink(missing_ok=True)
         if state in CUT_OFF or state == f"FAILED {EXIT_STOPPED}":
@@ -116,7 +116,7 @@ class SlurmJob:
         if state == "COMPLETED":
             return ""
         message = "ended, and Slurm does not say how" if state == "" else f"Slurm job {self._number}: {state}"
-        return ": ".join([message, *words])
+        return ": ".join(filter(None, [message, words]))
 
     def stop(self) -> None:
         """Have it save what it has, and end; out of the queue if it has not begun."""

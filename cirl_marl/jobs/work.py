@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import platform
 import sys
@@ -19,10 +18,16 @@ from filelock import FileLock, Timeout
 
 from cirl_marl.definitions.code_permission import code_allowed
 from cirl_marl.errors import RunError
-from cirl_marl.records.files import write_json
+from cirl_marl.records.files import read_record, write_json
 
 APART = 1.0
 """Seconds between two reports of a job."""
+MOST = 10**18
+"""Largest whole number that a job tells."""
+TEXTS = ("what", "said", "host")
+"""What a job tells that is no number."""
+TAIL = 2**16
+"""Bytes at the end of a log in which its last line is looked for."""
 EXIT_STOPPED = 75
 """Exit code of a worker that was told to stop, and whose work goes on in another one."""
 
@@ -85,21 +90,20 @@ class JobFiles:
         Raises:
             RunError: if the file is something else than what a job tells.
         """
-        try:
-            content = json.loads(self.progress_file.read_text())
-        except FileNotFoundError:
+        if not self.progress_file.exists():
             return {}
-        except ValueError as error:
-            raise RunError(f"{self.progress_file}: is not what a job told: {error}") from error
-        numbers = ("done", "total", "cpu_seconds")
-        if not isinstance(content, dict) or any(type(content.get(name, 0)) not in (int, float) for name in numbers):
-            raise RunError(f"{self.progress_file}: is not what a job told: {content!r:.80}")
+        content = read_record(self.progress_file)
+        for name, value in content.items():
+            if not (isinstance(value, str) if name in TEXTS else value is None or _is_number(value)):
+                raise RunError(f"{self.progress_file}: is not what a job told: {name} is {value!r:.80}")
+        done, total = content.get("done"), content.get("total")
+        if content and not (done is not None and total is not None and 0 <= done < MOST and 0 < total < MOST):
+            raise RunError(f"{self.progress_file}: is not what a job told: {done} is done of {total}")
         return content
 
     def last_words(self) -> str:
         """Return the last line of the log; empty if there is none."""
-        lines = text_lines(self.log.read_text(errors="replace")) if self.log.is_file() else []
-        return lines[-1] if lines else ""
+        return last_line(self.log)
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +167,19 @@ def do(job: Job, files: JobFiles, listen: Callable[[], None]) -> None:
         raise
 
 
+def _is_number(value: object) -> bool:
+    return isinstance(value, float) or (type(value) is int and abs(value) < MOST)
+
+
+def last_line(file: Path) -> str:
+    """Return the last line of a file in which something stands; empty if there is none, or no file."""
+    if not file.is_file():
+        return ""
+    with file.open("rb") as content:
+        content.seek(max(0, file.stat().st_size - TAIL))
+        return (text_lines(content.read(TAIL).decode(errors="replace")) or [""])[-1]
+
+
 def text_lines(text: str) -> list[str]:
     """Return the lines of a text in which something stands."""
     return [line.strip() for line in text.splitlines() if line.strip()]
@@ -171,7 +188,8 @@ def text_lines(text: str) -> list[str]:
 @contextmanager
 def _redirect_output(log: Path) -> Iterator[None]:
     """Let all that this process says, also from outside of Python, stand in its log."""
-    with log.open("w", buffering=1) as file:
+    log.unlink(missing_ok=True)  # were it another name of a file elsewhere, that would be emptied
+    with log.open("x", buffering=1) as file:
         for stream, descriptor in ((sys.stdout, 1), (sys.stderr, 2)):
             with contextlib.suppress(ValueError):  # it is closed
                 stream.flush()

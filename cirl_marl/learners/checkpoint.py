@@ -23,6 +23,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.errors import RunError
 from cirl_marl.learners.algorithms import RESERVED_PARAMETERS, parameters_of
+from cirl_marl.records.files import read_json
 
 KIND = "__kind__"
 """Key that says what a table stands for, if it is no table."""
@@ -53,7 +54,9 @@ def read_tree(folder: Path, name: str) -> Any:
     try:
         arrays = load_file(path)
         path = folder / f"{name}.json"
-        return _from_json(json.loads(path.read_text()), arrays)
+        return _from_json(read_json(path), arrays)
+    except RunError:
+        raise
     except UNREADABLE as error:
         raise RunError(f"{path}: cannot be read: {error}") from error
 

@@ -232,8 +232,9 @@ def _from_newest_checkpoint(
     for checkpoint in run.resumable():
         try:
             training = Training(config, run.make_env(config.envs), checkpoint, checkpoint_every)
-        except RunError as error:
-            errors.append(error)
+        except Exception as error:  # whatever comes of a damaged file
+            named = f"{checkpoint}: training cannot go on from it: {error!r}"
+            errors.append(error if isinstance(error, RunError) else RunError(named))
             continue
         for problem in errors:
             warnings.warn(f"{problem}; going on from {checkpoint.name} instead", stacklevel=3)

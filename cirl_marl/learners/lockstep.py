@@ -28,7 +28,7 @@ from stable_baselines3.common.utils import set_random_seed
 
 from cirl_marl.environments.state import Snapshot, State
 from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, ControlError, LearnerError
+from cirl_marl.errors import CirlError, ControlError, LearnerError, RunError
 from cirl_marl.learners.agent_env import AgentVecEnv, JointStep
 from cirl_marl.learners.barrier import CheckpointBarrier
 from cirl_marl.learners.views import BatchedEnv, OneAgent, View
@@ -340,6 +340,8 @@ class Lockstep:
         title, step = self._participants[i].title, self._joint_steps
         try:
             self._enter(i, self._coroutines[i].switch)
+        except RunError:  # of a checkpoint, which it loads at its first barrier
+            raise
         except Exception as error:
             raise LearnerError(f"{title} failed at joint step {step}: {error!r}") from error
         if self._coroutines[i].dead:

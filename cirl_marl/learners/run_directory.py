@@ -41,7 +41,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import RunError, unknown_name
 from cirl_marl.learners.recipe import OPTIONS, Group, Recipe, Settings
 from cirl_marl.network import Network
-from cirl_marl.records.files import refuse_links, sync, write_atomically, write_json
+from cirl_marl.records.files import read_content, read_record, refuse_links, sync, write_atomically, write_json
 from cirl_marl.records.machine import versions
 
 STATES = ("running", "complete", "interrupted", "failed")
@@ -167,7 +167,7 @@ class RunDirectory:
     def status(self) -> dict[str, Any]:
         """State, joint steps and checkpoint; a ``RunError`` if the file is missing or says something else."""
         status = self._json("status.json")
-        fits = isinstance(status, dict) and {"state", "joint_steps", "checkpoint"} <= set(status)
+        fits = {"state", "joint_steps", "checkpoint"} <= set(status)
         fits = fits and status["state"] in STATES and type(status["joint_steps"]) is int and status["joint_steps"] >= 0
         fits = fits and isinstance(status["checkpoint"], str | None) and _is_best(status.setdefault("best", None))
         if fits and status["checkpoint"] is not None and CHECKPOINT.fullmatch(status["checkpoint"]):
@@ -186,8 +186,6 @@ class RunDirectory:
     def other_versions(self) -> list[str]:
         """Return of what the run began with other versions than there are now."""
         then, now = self._json("versions.json"), versions()
-        if not isinstance(then, dict):
-            raise RunError(f"{self.path / 'versions.json'}: is no table of versions")
         return [f"{name} {then.get(name)}, now {now[name]}" for name in now if then.get(name) != now[name]]
 
     def reopen(self, config: RunConfig, checkpoint: Path | None) -> None:
@@ -265,7 +263,7 @@ class RunDirectory:
         if config.definition_sha256:
             files[self.definition] = config.definition_sha256
         for file, sha256 in files.items():
-            if (actual := hashlib.sha256(file.read_bytes()).hexdigest()) != sha256:
+            if (actual := hashlib.sha256(read_content(file)).hexdigest()) != sha256:
                 raise RunError(f"{file}: is not the file of this training, whose SHA-256 was {sha256}; it is {actual}")
         address = f"{self.definition}:{config.region}" if config.region else self.definition
         return load_network(address, scenario=config.scenario)
@@ -358,18 +356,16 @@ class RunDirectory:
             beside = sorted(str(config.parent) for config in self.path.parent.glob("*/config.json"))
             hint = f": {unknown_name('run', self.path, beside)}" if beside else ""
             raise RunError(f"no run in {self.path} (it has no config.json){hint}")
-        path = self._file(name)
-        try:
-            value: dict[str, Any] = json.loads(path.read_text())
-        except (ValueError, RecursionError) as error:
-            raise RunError(f"{path}: cannot be read: {error}") from error
-        return value
+        return read_record(self._file(name))
 
 
 def _complete_rows(path: Path) -> list[list[str]]:
     """Return the rows of a CSV file that end in a newline; a crash may have cut the last one short."""
-    text = path.read_text()
-    return list(csv.reader(text[: text.rfind("\n") + 1].splitlines()))
+    try:
+        text = read_content(path).decode()
+        return list(csv.reader(text[: text.rfind("\n") + 1].splitlines()))
+    except (OSError, ValueError, csv.Error) as error:
+        raise RunError(f"{path}: cannot be read: {error}") from error
 
 
 def steps_of(checkpoint: Path) -> int:
@@ -380,10 +376,9 @@ def steps_of(checkpoint: Path) -> int:
 def _best_at(checkpoint: Path) -> dict[str, Any] | None:
     """Return which checkpoint was the best when one was written from which the run can go on."""
     path = checkpoint / "training.json"
-    try:
-        best: dict[str, Any] | None = json.loads(path.read_text())["best"] if path.is_file() else None
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise RunError(f"{path}: cannot be read: {error!r}") from error
+    if not path.is_file():
+        return None
+    best: dict[str, Any] | None = read_record(path).get("best", {})
     if not _is_best(best):
         raise RunError(f"{path}: is not what a training wrote: best = {best!r}")
     return best

@@ -7,7 +7,6 @@ constraint.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import fields
@@ -21,7 +20,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import RunError
 from cirl_marl.learners.policies import Policies
 from cirl_marl.network.declarations import positional_record
-from cirl_marl.records.files import write_json
+from cirl_marl.records.files import read_record, write_json
 
 FIRST_SEED = 2**40
 """First seed of the episodes that choose; those of training and of reports are below it."""
@@ -124,7 +123,10 @@ class ServiceMultiplier:
         """Load what ``save`` wrote; a ``RunError`` if they are missing or none."""
         path = folder / "price.json"
         try:
-            state = json.loads(path.read_text())
-            self._env.circularity_weight, self._integral = state["circularity_weight"], state["lasting_price"]
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            state = read_record(path)
+            weight, integral = float(state["circularity_weight"]), float(state["lasting_price"])
+            if not (0.0 <= weight <= 1.0 and 0.0 <= integral < math.inf):
+                raise ValueError(f"a weight of {weight} and a price of {integral}")
+        except (KeyError, TypeError, ValueError) as error:
             raise RunError(f"{path}: cannot be read: {error!r}; it holds the price of service") from error
+        self._env.circularity_weight, self._integral = weight, integral

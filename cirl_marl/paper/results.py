@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from cirl_marl.errors import RunError
-from cirl_marl.records.files import write_atomically
+from cirl_marl.records.files import read_record, write_atomically
 
 CURVE_POINTS = 500
 WINDOW = 100
@@ -171,7 +171,7 @@ def _one_line_each(plain: dict[str, Any]) -> str:
 
 def _read(path: Path) -> Result:
     try:
-        plain = json.loads(path.read_text())
+        plain = read_record(path)
         plain["row"].setdefault("settings", plain["row"].pop("recipe", "published"))  # what files of 0.1 call it
         return TypeAdapter(Result).validate_python(plain)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:

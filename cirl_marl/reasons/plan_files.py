@@ -21,6 +21,7 @@ from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum.options import by_stage
 from cirl_marl.reasons.objective_terms import PlannedEpisode
+from cirl_marl.records.files import read_content
 
 ALIKE = 1e-4
 """Relative distance of circularities up to which an episode that is simulated again is the one in a table."""
@@ -89,7 +90,11 @@ class _Table:
         if not path.is_file():
             raise CirlError(f"{path}: no such file; a plan is a CSV file of cirl plan or cirl simulate, or a run")
         self.path = path
-        (_, self.header), *self.rows = even_lines(str(path), csv_lines(str(path), path.read_bytes()))
+        try:
+            content = read_content(path)
+        except OSError as error:
+            raise CirlError(f"{path}: cannot be read: {error}") from error
+        (_, self.header), *self.rows = even_lines(str(path), csv_lines(str(path), content))
 
     def check_steps(self, network: Network, intervals: int) -> None:
         """Check how many intervals it has, which are those of an episode."""

@@ -10,8 +10,12 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from cirl_marl.errors import RunError
+
+LARGEST = 200_000_000
+"""Bytes of the largest file that is read as a whole."""
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
@@ -36,16 +40,47 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
+def read_content(path: Path) -> bytes:
+    """Return what is in a regular file.
+
+    Raises:
+        OSError: if it is missing, something that may never end, as a pipe or a device, or larger than ``LARGEST``.
+    """
+    size = path.stat().st_size
+    if not path.is_file():
+        raise OSError(f"'{path}' is no regular file")
+    if size > LARGEST:
+        raise OSError(f"'{path}' has {size / 1e6:.0f} MB, and at most {LARGEST // 10**6} MB are read")
+    with path.open("rb") as file:
+        return file.read(size)
+
+
+def read_json(path: Path) -> Any:
+    """Return what a JSON file says; a ``RunError`` if it cannot be read."""
+    try:
+        return json.loads(read_content(path))
+    except (OSError, ValueError, RecursionError) as error:
+        raise RunError(f"{path}: cannot be read: {error}") from error
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """Return what a JSON file says that holds an object; a ``RunError`` if it cannot be read, or is something else."""
+    record = read_json(path)
+    if not isinstance(record, dict):
+        raise RunError(f"{path}: is no JSON object")
+    return record
+
+
 def write_json(path: Path, value: object) -> None:
     """Write JSON atomically."""
     write_atomically(path, lambda temporary: temporary.write_text(json.dumps(value, indent=2) + "\n"))
 
 
 def refuse_links(folder: Path) -> None:
-    """Refuse a folder in which, or below which, a link stands: nothing outside of it may be read or written.
+    """Refuse a folder below which a link stands, as nothing outside may be read or written, or a pipe or a device.
 
     Raises:
-        RunError: naming the link.
+        RunError: naming it.
     """
     for parent, folders, files in os.walk(folder):
         for path in (Path(parent) / name for name in (*folders, *files)):
@@ -53,6 +88,9 @@ def refuse_links(folder: Path) -> None:
                 raise RunError(
                     f"{path}: is a link; nothing outside of {folder} is read or written, so put a copy there"
                 )
+        for path in (Path(parent) / name for name in files):
+            if path.exists() and not path.is_file():
+                raise RunError(f"{path}: is no file but a pipe, a socket or a device, which may never end")
 
 
 @contextmanager

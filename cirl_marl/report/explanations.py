@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,7 @@ from cirl_marl.reasons.sentences import (
     paragraphs,
     signal_text,
 )
-from cirl_marl.records.files import publish_folder, write_json, write_table
+from cirl_marl.records.files import publish_folder, read_record, write_json, write_table
 from cirl_marl.report.terminal import text_table
 
 FOLDER, FILE = "reasons", "reasons.json"
@@ -81,11 +80,11 @@ def read_reasons(run: RunDirectory, checkpoint: str) -> tuple[Reasons, str]:
     if not path.is_file():
         return (), f"no reasons: {advice}"
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
+        record = read_record(path)
         sections = tuple((str(heading), tuple(map(str, sentences))) for heading, sentences in record["sections"])
         if record["checkpoint"] != checkpoint:
             return (), f"no reasons: those in {path.name} are of another checkpoint; {advice} anew"
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise RunError(f"{path}: cannot be read: {error!r}; delete it, or explain the run anew") from error
     return sections, ""
 

@@ -21,7 +21,8 @@ from typing import Any
 from filelock import FileLock
 
 from cirl_marl.errors import RunError
-from cirl_marl.records.files import refuse_links, write_atomically, write_json, write_table
+from cirl_marl.jobs.work import JobFiles
+from cirl_marl.records.files import read_record, refuse_links, write_atomically, write_json, write_table
 from cirl_marl.sweeps.cells import Cell
 from cirl_marl.sweeps.reading import SweepFile, SweepOptions
 
@@ -55,6 +56,8 @@ class SweepFolder:
                 self._check(now, self._stored_request())
             for cell in cells:
                 file = self.cell(cell.name) / "cell.json"
+                if file.is_file() and read_record(file) != json.loads(json.dumps(cell.content)):
+                    raise RunError(f"{file}: is not what the cell of this name is")
                 if not file.is_file():
                     file.parent.mkdir(parents=True, exist_ok=True)
                     write_json(file, cell.content)
@@ -92,11 +95,10 @@ class SweepFolder:
 
     def row(self, name: str) -> dict[str, Any]:
         """Return the row of a cell."""
-        content = _json(self.cell(name) / "cell.json")
+        content = read_record(self.cell(name) / "cell.json")
         run, environment = content["recipe"]["run"], content["recipe"]["environment"]
         file = self.cell(name) / "result.json"
-        result = _json(file) if file.is_file() else {}
-        figures = self.jobs / f"{name}.json"
+        result = _result(file) if file.is_file() else {}
         row: dict[str, Any] = {"cell": name, "state": "done" if result else "missing"}
         row |= {key: content[key] for key in ("network", "scenario")}
         row |= {"recipe": content["recipe"]["name"], "seed": content["seed"]}
@@ -110,14 +112,14 @@ class SweepFolder:
                 f"{figure}_high": interval.get("high"),
             }
         row |= {key: result.get(key) or None for key in ("unit", "no_bound", "checkpoint")}
-        return row | {"cpu_seconds": _json(figures).get("cpu_seconds") if figures.is_file() else None}
+        return row | {"cpu_seconds": JobFiles(self.jobs, name).figures().get("cpu_seconds")}
 
     @property
     def _request_path(self) -> Path:
         return self.path / "asked.json"
 
     def _stored_request(self) -> dict[str, Any]:
-        return _json(self._request_path)
+        return read_record(self._request_path)
 
     def _strangers(self) -> Iterator[str]:
         names = {"cells", "bounds", "jobs", ".asked.lock", ".asked.partial.json"}
@@ -134,14 +136,17 @@ class SweepFolder:
 
     def _check(self, now: dict[str, Any], content: dict[str, Any]) -> None:
         """Refuse to make another sweep of the one that is kept; one may add cells to it."""
-        missing_cells = set(content["cells"]) - set(now["cells"])
-        if not missing_cells and now["evaluation"] == content["evaluation"]:
+        cells = content.get("cells")
+        if not isinstance(cells, list) or not all(isinstance(cell, str) for cell in cells):
+            raise RunError(f"{self._request_path}: is not what a sweep asks for: it names no cells")
+        missing_cells = set(cells) - set(now["cells"])
+        if not missing_cells and now["evaluation"] == content.get("evaluation"):
             return
         mismatches = [name for key in now if key != "cells" for name in _differences(now[key], content.get(key), key)]
         more = f" and {len(mismatches) - MISMATCHES_SHOWN} more" if len(mismatches) > MISMATCHES_SHOWN else ""
         raise RunError(
             f"{self.path}: holds another sweep ({'; '.join(mismatches[:MISMATCHES_SHOWN])}{more}), of which "
-            f"{len(missing_cells)} of {len(content['cells'])} cells are none of this one; "
+            f"{len(missing_cells)} of {len(cells)} cells are none of this one; "
             "choose another folder. Nothing was changed"
         )
 
@@ -152,12 +157,19 @@ OPTION_COLUMNS = tuple(_ENVIRONMENT.get(name, name) for name in SweepOptions.mod
 """Columns of the options of a sweep file, in its order."""
 
 
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        content: dict[str, Any] = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise RunError(f"{path}: cannot be read: {error}") from error
-    return content
+def _result(file: Path) -> dict[str, Any]:
+    """Return what came of a cell; a ``RunError`` if the file is something else."""
+    result = read_record(file)
+    for name in (*INTERVALS, "unit", "no_bound", "checkpoint"):
+        value = result.get(name)
+        fits = value is None or (
+            isinstance(value, dict) and all(isinstance(part, int | float | None) for part in value.values())
+            if name in INTERVALS
+            else isinstance(value, str)
+        )
+        if not fits:
+            raise RunError(f"{file}: is not what came of a cell: {name} is {value!r:.80}; delete it to evaluate anew")
+    return result
 
 
 def _differences(request: Any, content: Any, prefix: str) -> Iterator[str]:

@@ -5,7 +5,6 @@ It is proved for the middle of the initial ranges alone, so these gaps are a lit
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +13,11 @@ from typing import Any
 import numpy as np
 
 from cirl_marl.definitions.catalogue import load_network
+from cirl_marl.errors import RunError
 from cirl_marl.jobs import Tell
 from cirl_marl.optimum import NoCertificate, bound, gap
 from cirl_marl.optimum.bounds import highest_service
-from cirl_marl.records.files import write_json
+from cirl_marl.records.files import read_record, write_json
 from cirl_marl.sweeps.cells import DIGITS, Cell, plain_name
 
 DEMAND = 0.9
@@ -78,8 +78,12 @@ class FrontJob:
         """Return how far policies with these figures are from the front, about; None if that is not known."""
         if not self.is_done() or "circularity" not in figures:
             return None
-        front = json.loads(self.file.read_text())
-        if not front["levels"]:
+        front = read_record(self.file)
+        try:
+            levels, proved = (np.array(front[name], dtype=float) for name in ("levels", "proved"))
+            points = np.interp(figures["service"], levels, proved) if levels.size else None
+        except (KeyError, TypeError, ValueError) as error:
+            raise RunError(f"{self.file}: is not what is proved of a network: {error!r}; delete it") from error
+        if points is None:
             return None
-        points = np.interp(figures["service"], front["levels"], front["proved"])
         return max(0.0, float(gap(points, figures["circularity"])))

@@ -29,6 +29,7 @@ from cirl_marl.learners.recipe import LearnerSettings, Normalisation
 from cirl_marl.learners.teams.copies import Copies, MakeEnv
 from cirl_marl.learners.teams.presence import TeamVecEnv, leave_out_absent
 from cirl_marl.learners.trainer import one_torch_thread
+from cirl_marl.records.files import refuse_links
 
 Algorithm = Callable[..., BaseAlgorithm]
 """A class of Stable-Baselines3 or sb3-contrib, or one with parameters: ``functools.partial(PPO, n_steps=128)``."""
@@ -249,6 +250,7 @@ class Team:
             RunError: if a file is missing, cannot be read, or is of another environment.
         """
         path = Path(folder)
+        refuse_links(path)
         state = read_tree(path, "team")
         try:
             settings = {agent: LearnerSettings.model_validate(spec) for agent, spec in state["agents"].items()}

@@ -1,0 +1,171 @@
+"""Rows of texts, of a CSV file or of a sheet, by what their columns mean: some thousands at a time."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from operator import itemgetter
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from cirl_marl.definitions.data_files import Block, csv_blocks, even_lines, number_in
+from cirl_marl.errors import CirlError, unknown_name
+from cirl_marl.importing.workbooks import read_sheets
+from cirl_marl.records.files import read_content
+
+K = TypeVar("K")
+V = TypeVar("V")
+NAMES: Mapping[str, tuple[str, ...]] = {
+    "source": ("source", "from", "origin"),
+    "target": ("target", "to", "destination"),
+    "year": ("year", "time"),
+    "value": ("value", "flow", "amount", "mass"),
+    "unit": ("unit", "units"),
+    "type": ("type", "good", "material"),
+    "region": ("region", "country"),
+    "uncertainty": ("uncertainty", "deviation"),
+    "process": ("process", "node", "stock of"),
+}
+"""What columns may be called, whatever the case."""
+WORKBOOKS = (".xlsx", ".xlsm")
+
+
+@dataclass(frozen=True, slots=True)
+class GridPart:
+    """Some rows of a grid, and the numbers of the lines on which they end."""
+
+    grid: Grid
+    lines: Sequence[int]
+    rows: Sequence[Sequence[str]]
+
+    def of(self, key: str) -> list[str]:
+        """Return the texts of a column; empty ones if there is no such column."""
+        if key not in self.grid.places:
+            return [""] * len(self.rows)
+        return list(map(itemgetter(self.grid.places[key]), self.rows))
+
+    def converted(self, texts: Sequence[K], values: Memo[K, V]) -> list[V]:
+        """Return what the texts of each row mean; a ``CirlError`` of one that means nothing names its line as well."""
+        try:
+            return list(map(values.__getitem__, texts))
+        except CirlError as error:
+            line = next(line for line, text in zip(self.lines, texts, strict=True) if text not in values)
+            raise CirlError(f"{self.grid.name}, line {line}: {error}") from error
+
+    def numbers(self, column: int, texts: Sequence[str]) -> list[float]:
+        """Return the numbers of a column; a ``CirlError`` names file, line and column of what is negative or none."""
+        try:
+            values = list(map(float if "_" not in "".join(texts) else number_in, texts))
+        except ValueError:
+            values = list(map(number_in, texts))
+        array = np.array(values)
+        if not ((array >= 0.0) & (array < math.inf)).all():
+            i = next(i for i, value in enumerate(values) if not 0.0 <= value < math.inf)
+            fault = "is no number; write one as in 1234.5, or leave out the row"
+            if math.isfinite(values[i]):
+                fault = "is negative; a flow runs from source to target: swap them"
+            text = texts[i] if math.isfinite(values[i]) else f"'{texts[i]}'"
+            place = f"{self.grid.name}, line {self.lines[i]}, column '{self.grid.header[column]}'"
+            raise CirlError(f"{place}: {text} {fault}")
+        return values
+
+
+class Memo(dict[K, V]):
+    """What texts mean, found once for each."""
+
+    def __init__(self, convert: Callable[[K], V]) -> None:
+        """Let ``convert`` find it."""
+        super().__init__()
+        self._convert = convert
+
+    def __missing__(self, key: K) -> V:
+        """Find what a text means."""
+        value = self[key] = self._convert(key)
+        return value
+
+
+class Grid:
+    """The cells of a file or a sheet, as texts, some thousands of rows at a time; blank rows are left out.
+
+    Attributes:
+        header: texts of the first row.
+        places: columns by what they mean.
+    """
+
+    def __init__(self, name: str, blocks: Iterator[Block]) -> None:
+        """Read the header; a ``CirlError`` if there is none, or if two columns mean the same."""
+        self.name = name
+        self._blocks = (block for block in map(_without_blanks, blocks) if block[1])
+        empty: Block = (0,), [[]]
+        lines, rows = next(self._blocks, empty)
+        self.header = rows[0]
+        self._first: Block = lines[1:], rows[1:]
+        if not self.header:
+            raise CirlError(f"{name}: is empty; its first line names the columns")
+        plain = [title.strip().lower() for title in self.header]
+        self.places: dict[str, int] = {}
+        for key, names in NAMES.items():
+            columns = [i for i, title in enumerate(plain) if title in names]
+            if len(columns) > 1:
+                titles = " and ".join(f"'{self.header[i]}'" for i in columns[:2])
+                raise CirlError(f"{self.name}, line 1: {titles} both mean {key}; rename one")
+            if columns:
+                self.places[key] = columns[0]
+
+    def parts(self) -> Iterator[GridPart]:
+        """Yield the rows below the header; a ``CirlError`` names one that is not as long as it."""
+        for lines, rows in itertools.chain([self._first], self._blocks):
+            if not set(map(len, rows)) <= {len(self.header)}:
+                even_lines(self.name, [(1, self.header), *zip(lines, rows, strict=True)])
+            yield GridPart(self, lines, rows)
+
+    def require(self, keys: Sequence[str]) -> None:
+        """Refuse a grid that lacks one of some columns; a ``CirlError`` names it."""
+        for key in keys:
+            if key not in self.places:
+                need = f"column '{key}'; it has {', '.join(filter(None, self.header)) or 'none'}"
+                raise CirlError(f"{self.name}, line 1: needs a {need}. Separate columns with commas.")
+
+
+def _without_blanks(block: Block) -> Block:
+    """Return a block without rows of blanks."""
+    lines, rows = block
+    if all(map(str.strip, map(itemgetter(0), rows))):
+        return block
+    filled = [i for i, row in enumerate(rows) if row[0].strip() or any(map(str.strip, row))]
+    return [lines[i] for i in filled], [rows[i] for i in filled]
+
+
+def read_grids(path: Path, sheet: str | None) -> Iterator[Grid]:
+    """Yield the tables of a file."""
+    if not path.exists():
+        raise CirlError(f"{path}: no such file")
+    try:
+        content = read_content(path)
+    except OSError as error:
+        raise CirlError(f"{path}: cannot be read: {error}") from error
+    if path.suffix.lower() in WORKBOOKS:
+        for name, rows in read_sheets(path, content, lambda names: _sheet_names(path, names, sheet)):
+            yield Grid(f"{path.name}, sheet '{name}'", iter([rows]))
+        return
+    if sheet is not None:
+        raise CirlError(f"{path}: is no workbook, so that it has no sheet '{sheet}'")
+    yield Grid(path.name, csv_blocks(str(path), content))
+
+
+def _sheet_names(path: Path, names: Sequence[str], sheet: str | None) -> Sequence[str]:
+    """Return which sheets of a workbook are read: the one that is named, those of years, or the first."""
+    if sheet is None:
+        return [name for name in names if is_year(name)] or names[:1]
+    if sheet not in names:
+        raise CirlError(f"{path}: {unknown_name('sheet', sheet, names)}")
+    return [sheet]
+
+
+def is_year(text: str) -> bool:
+    """Return whether a sheet is named by a year."""
+    return len(text) == 4 and text.isascii() and text.isdigit()
