@@ -165,7 +165,8 @@ class Learner:
             self.was_in_stack = state["stacked"]
             self._first_timestep = state["model"]["values"]["_num_timesteps_at_start"]
             self.model.num_timesteps = self._first_timestep
-            self.barrier.replay_log = [(np.array(action, np.float32), StepResult.from_state(step)) for action, step in log]
+            steps = ((np.array(action, np.float32), StepResult.from_state(step)) for action, step in log)
+            self.barrier.replay_log = list(steps)
             if self.was_in_stack:
                 load()
             last_step = StepResult.from_state(state["handed"])
