@@ -219,7 +219,7 @@ def test_plans(tmp_path: Path) -> None:
     (tmp_path / "plans").mkdir()
     cirl_marl.plan(network, "scripted").write(tmp_path / "plans" / "plan.csv")
     uses: dict[str, Use] = {"plan": lambda path: episodes_of_plan(network, path / "plan.csv")}
-    assert use_altered(tmp_path / "plans", uses, tmp_path, 60)
+    assert use_altered(tmp_path / "plans", uses, tmp_path, 12)
     os.mkfifo(tmp_path / "pipe.csv")
     for path, said in (("pipe.csv", "no such file"), ("missing.csv", "no such file"), ("plans", "no run in")):
         with pytest.raises(CirlError, match=said):

@@ -300,6 +300,7 @@ def test_what_is_no_network_agent_or_seed(tmp_path: Path) -> None:
         ("x = " + "[" * 5000 + "]" * 5000, "nested too deeply"),
         ("x = " + "9" * 5000, "thousands of digits"),
         ("x = " + "9" * 30, "x: is an integer of 30 digits"),
+        ("x = 0x" + "f" * 4000, "x: is an integer of 4816 digits"),
     ):
         path.write_text(line + "\n" + text)
         with pytest.raises(CirlError, match=said):

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,11 +22,9 @@ from cirl_marl.network.calendar import YearOrDate
 from cirl_marl.records.files import LARGEST, read_content
 
 T = TypeVar("T")
-Line = tuple[int, list[str]]
-"""A row of a table, with the number of the line on which it ends."""
 Block = tuple[Sequence[int], list[list[str]]]
 """Rows of a table, with the numbers of the lines on which they end."""
-BLOCK = 512
+BLOCK = 2048
 """Rows of a block."""
 BREAK = re.compile("\r\n?|\n")
 """What ends a line, inside of a cell too."""
@@ -73,20 +72,29 @@ def csv_blocks(subject: str, content: bytes) -> Iterator[Block]:
         raise CirlError(f"{subject}: is no CSV file in UTF-8: {error}") from error
 
 
-def csv_lines(subject: str, content: bytes) -> list[Line]:
-    """Return the lines of a CSV file that are not empty; a ``CirlError`` if it is none."""
+def csv_rows(subject: str, content: bytes) -> Block:
+    """Return the rows of a CSV file that are not empty, with their lines.
+
+    Raises:
+        CirlError: if it is no CSV file, there are no rows, or one is not as long as the first.
+    """
+    lines: list[int] = []
+    rows: list[list[str]] = []
     with no_collection():
-        return [line for lines, rows in csv_blocks(subject, content) for line in zip(lines, rows, strict=True)]
-
-
-def even_lines(subject: str, lines: list[Line]) -> list[Line]:
-    """Return the lines of a table; a ``CirlError`` if there are none, or if one is not as long as the first."""
-    if not lines:
+        for block_lines, block_rows in csv_blocks(subject, content):
+            lines += block_lines
+            rows += block_rows
+    if not rows:
         raise CirlError(f"{subject}: is empty; its first line names the columns")
-    for line, row in lines:
-        if len(row) != len(lines[0][1]):
-            raise CirlError(f"{subject}, line {line}: {len(row)} cells in {len(lines[0][1])} columns")
-    return lines
+    check_lengths(subject, lines, rows, len(rows[0]))
+    return lines, rows
+
+
+def check_lengths(subject: str, lines: Sequence[int], rows: Sequence[Sequence[str]], width: int) -> None:
+    """Raise a ``CirlError`` if a row has not as many cells as there are columns."""
+    if not set(map(len, rows)) <= {width}:
+        line, row = next((line, row) for line, row in zip(lines, rows, strict=True) if len(row) != width)
+        raise CirlError(f"{subject}, line {line}: {len(row)} cells in {width} columns")
 
 
 def number_in(text: str) -> float:
@@ -184,7 +192,7 @@ class _Table:
 
     def __init__(self, name: str, content: bytes) -> None:
         self.name, self.sha256 = name, hashlib.sha256(content).hexdigest()
-        (_, self.header), *self.rows = even_lines(f"file '{name}'", csv_lines(f"file '{name}'", content))
+        (_, *self.lines), (self.header, *self.rows) = csv_rows(f"file '{name}'", content)
         self.place = {column: i for i, column in enumerate(self.header)}
         if len(self.place) != len(self.header):
             twice = next(name_ for name_ in self.header if self.header.count(name_) > 1)
@@ -199,14 +207,15 @@ class _Table:
                 fault = f"file '{self.name}': {unknown_name('column', key, self.header)}"
                 raise CirlError(fault + ("" if len(self.header) > 1 else " Separate columns with commas."))
         matches = self._matching_rows(conditions)
-        lines = [self.rows[i][0] for i in matches]
-        values = [self._number(*self.rows[i], column) for i in matches]
+        values = [self._number(i, column) for i in matches]
         origin = f"{self.name}, column '{column}'" + (f", where {_conditions(conditions)}" if conditions else "")
         if times is not None:
             return Column(self._times(matches, times), values, origin)
         if len(matches) > 1:
             remedy = "fix more columns in 'where', or name the column of times in 'times'"
-            raise CirlError(f"{origin}: lines {lines[0]} and {lines[1]} both match; {remedy}")
+            raise CirlError(
+                f"{origin}: lines {self.lines[matches[0]]} and {self.lines[matches[1]]} both match; {remedy}"
+            )
         return Column(None, values, origin)
 
     def _matching_rows(self, conditions: Mapping[str, str]) -> list[int]:
@@ -214,8 +223,12 @@ class _Table:
         keys = tuple(self.place[column_] for column_ in conditions)
         if keys not in self._indices:
             index: dict[tuple[str, ...], list[int]] = {}
-            for i, (_, row) in enumerate(self.rows):
-                index.setdefault(tuple(row[key] for key in keys), []).append(i)
+            columns = [map(itemgetter(key), self.rows) for key in keys]
+            for i, texts in enumerate(zip(*columns, strict=True) if keys else itertools.repeat((), len(self.rows))):
+                if texts in index:
+                    index[texts].append(i)
+                else:
+                    index[texts] = [i]
             self._indices[keys] = index
         matches = self._indices[keys].get(tuple(conditions.values()))
         if not matches:
@@ -224,7 +237,7 @@ class _Table:
 
     def _mismatch(self, conditions: Mapping[str, str]) -> str:
         """Say which entry of ``conditions`` leaves no row, with the nearest value that would leave one."""
-        rows, before = [row for _, row in self.rows], ""
+        rows, before = self.rows, ""
         for key, value in conditions.items():
             options = dict.fromkeys(row[self.place[key]] for row in rows)
             if value not in options:
@@ -233,8 +246,8 @@ class _Table:
             before += f"{' and' if before else ' with'} {key} = '{value}'"
         return "has no rows"
 
-    def _number(self, line: int, row: Sequence[str], column: str) -> float:
-        text = row[self.place[column]]
+    def _number(self, i: int, column: str) -> float:
+        line, text = self.lines[i], self.rows[i][self.place[column]]
         value = number_in(text)
         if not math.isfinite(value):
             remedy = "is no number; write one as in 1234.5" if text.strip() else "is empty; write a number, or 0"
@@ -243,14 +256,14 @@ class _Table:
 
     def _times(self, matches: Iterable[int], column: str) -> list[YearOrDate]:
         """Return the times of rows, which increase; all numbers or all dates, as the first is."""
-        has_dates = _date(self.rows[next(iter(matches))][1][self.place[column]]) is not None
+        has_dates = _date(self.rows[next(iter(matches))][self.place[column]]) is not None
         line_of: dict[Any, int] = {}
         latest: Any = None
         for i in matches:
-            line, row = self.rows[i]
+            line, row = self.lines[i], self.rows[i]
             subject = f"file '{self.name}', line {line}, column '{column}'"
             text = row[self.place[column]]
-            time: Any = _date(text) if has_dates else self._number(line, row, column)
+            time: Any = _date(text) if has_dates else self._number(i, column)
             if time is None:
                 raise CirlError(f"{subject}: '{text}' is no date such as 2020-03-01, as others are")
             if time in line_of:

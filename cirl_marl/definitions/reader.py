@@ -213,7 +213,7 @@ def _impossible(document: Mapping[str, Any]) -> Iterator[str]:
             parts = value.items() if isinstance(value, dict) else enumerate(value)
             entries += [(f"{path}.{key}".lstrip("."), depth + 1, entry) for key, entry in parts]
         elif isinstance(value, int) and not -(2**63) <= value < 2**63:
-            yield f"{path}: is an integer of some {math.ceil(value.bit_length() * math.log10(2))} digits; {DIGITS}"
+            yield f"{path}: is an integer of {math.floor(value.bit_length() * math.log10(2))} digits; {DIGITS}"
 
 
 def _strangers(document: Mapping[str, Any], override: Mapping[str, Any], prefix: str) -> Iterator[str]:

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from cirl_marl.definitions.data_files import Block, csv_blocks, even_lines, number_in
+from cirl_marl.definitions.data_files import Block, check_lengths, csv_blocks, number_in
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.importing.workbooks import read_sheets
 from cirl_marl.records.files import read_content
@@ -119,8 +119,7 @@ class Grid:
     def parts(self) -> Iterator[GridPart]:
         """Yield the rows below the header; a ``CirlError`` names one that is not as long as it."""
         for lines, rows in itertools.chain([self._first], self._blocks):
-            if not set(map(len, rows)) <= {len(self.header)}:
-                even_lines(self.name, [(1, self.header), *zip(lines, rows, strict=True)])
+            check_lengths(self.name, lines, rows, len(self.header))
             yield GridPart(self, lines, rows)
 
     def require(self, keys: Sequence[str]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import episode_start, first_seed, rollout
 from cirl_marl.controllers.schedule import control_names
-from cirl_marl.definitions.data_files import csv_lines, even_lines, number_in
+from cirl_marl.definitions.data_files import csv_rows, number_in
 from cirl_marl.dynamics.stages import simulated_network
 from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.environments.actuators import Actuators
@@ -94,7 +94,7 @@ class _Table:
             content = read_content(path)
         except OSError as error:
             raise CirlError(f"{path}: cannot be read: {error}") from error
-        (_, self.header), *self.rows = even_lines(str(path), csv_lines(str(path), content))
+        (_, *self.lines), (self.header, *self.rows) = csv_rows(str(path), content)
 
     def check_steps(self, network: Network, intervals: int) -> None:
         """Check how many intervals it has, which are those of an episode."""
@@ -107,7 +107,7 @@ class _Table:
         if name not in self.header:
             raise CirlError(f"{self.path}: {unknown_name('column', name, self.header)} It is no plan of this network")
         place, numbers = self.header.index(name), []
-        for line, row in self.rows[first:]:
+        for line, row in zip(self.lines[first:], self.rows[first:], strict=True):
             numbers.append(number_in(row[place]))
             if not math.isfinite(numbers[-1]):
                 raise CirlError(f"{self.path}, line {line}: '{name}' is {row[place]!r}, not a number")
