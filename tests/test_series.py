@@ -80,6 +80,8 @@ def replaced(horizon: int = 4, start: Any = None, **changes: Any) -> Network:
         (Series(times=(0.0, 0.0), values=(1.0, 2.0)), "times must increase and be finite, but 0 follows 0"),
         (Series(times=(0.0, math.inf), values=(1.0, 2.0)), "times must increase and be finite, but inf follows 0"),
         (Series(times=(0.0,), values=(math.nan,)), "series: times and values must be finite"),
+        (Series(times=(0.0, 1e200), values=(1.0, 2.0)), "must be at most 1e+50 in size, but 1e+200 stands there"),
+        (Series(times=(0.0, 1e-300), values=(1.0, 2.0)), "series: times must be at least 1e-50 apart"),
         (Series(times=(0.0, 2.0), values=(1.0, 2.0), until=1.0), "until 1 lies before its last time, 2"),
         (
             Series(times=(0.5,), values=(1.0,)),

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import pickle
 import shutil
+import signal
 import subprocess
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
+from test_jobs import wait_until
+from test_sweep import RECIPE, SWEEP
 from written_jobs import Exploding, written
 
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.jobs import JobStatus, run_jobs, slurm
 from cirl_marl.jobs.slurm import Queue, sbatch_options
 from cirl_marl.jobs.work import JobFiles
+from cirl_marl.network import Network
 
 TESTS = Path(__file__).parent
 COMMANDS = {
@@ -242,3 +248,33 @@ def test_a_job_at_its_time_limit_goes_on(node: str, tmp_path: Path) -> None:
     assert run_jobs([job], tmp_path / "jobs", on="slurm", settings={"timeout_min": "1"}) == []
     assert len(job.file.with_suffix(".begun").read_text().splitlines()) >= 2, time.monotonic() - began
     assert json.loads(JobFiles(tmp_path / "jobs", "a").progress_file.read_text())["what"] == "done"
+
+
+@pytest.mark.slow
+def test_killed_drivers_change_nothing(node: str, bottles: Network, tmp_path: Path) -> None:
+    """Killed when jobs wait, when one trains and when one is done, and a job with it: the table is that of one place."""
+    if node == "accounting":
+        pytest.skip("takes a minute, and is the same with accounting")
+    assert bottles.source is not None
+    (tmp_path / "bottles.toml").write_text(bottles.source.read_text())
+    (tmp_path / "quick.toml").write_text(RECIPE.format(name="quick", algorithm="A2C", n_steps=5))
+    (tmp_path / "sweep.toml").write_text(SWEEP)
+
+    def sweep(on: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "cirl_marl.cli", "sweep", "sweep.toml", "--on", on, "--out", on]
+        return subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL)
+
+    def table(on: str) -> list[dict[str, str]]:
+        with (tmp_path / on / "sweep.csv").open(newline="") as file:
+            return [{key: cell for key, cell in row.items() if key != "cpu_seconds"} for row in csv.DictReader(file)]
+
+    for sign in ("jobs/.slurm-*/*.pkl", "jobs/*-quick-*.json", "cells/*/result.json"):
+        driver = sweep("slurm")
+        wait_until(lambda pattern=sign: any((tmp_path / "slurm").glob(pattern)))
+        driver.kill()
+        assert driver.wait() == -signal.SIGKILL
+        subprocess.run(["scancel", "--me", "--state=RUNNING", "--signal=KILL"], check=True)
+    assert sweep("slurm").wait() == 0
+    assert sweep("local").wait() == 0
+    assert table("slurm") == table("local")
+    assert {row["state"] for row in table("slurm")} == {"done"}

@@ -11,6 +11,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from cirl_marl.network.declarations import (
+    LARGEST,
+    SMALLEST,
     CheckedRecord,
     Declaration,
     Numbers,
@@ -78,6 +80,10 @@ class Series(CheckedRecord, TimeDependent):
                 return
         if not all(map(math.isfinite, (self.times[0], *self.values))):
             yield "series: times and values must be finite"
+        elif largest := [x for x in (*self.times, *self.values) if abs(x) > LARGEST]:
+            yield f"series: times and values must be at most {LARGEST:g} in size, but {largest[0]:g} stands there"
+        elif any(after - before < SMALLEST for before, after in pairwise(self.times)):
+            yield f"series: times must be at least {SMALLEST:g} apart"
         elif self.until is not None and not self.until >= self.times[-1]:
             yield f"series: until {self.until:g} lies before its last time, {self.times[-1]:g}"
         if self.factor is not None:
