@@ -112,14 +112,14 @@ def _read_flows(path: Path, sheet: str | None, default_unit: str | None, default
             for unit_of_row, line in entries.units.items():
                 units.setdefault(unit_of_row, f"{grid.name}, line {line}")
             if len(flows) < len(keys):
-                raise CirlError(_repeated(keys, places))
+                raise CirlError(_repetition(keys, places))
     if not flows:
         raise CirlError(f"{path}: has no flows")
     _check_years(path.name, present)
     return FlowTable(path.name, _unit(path, units, default_unit), flows, deviations)
 
 
-def _repeated(keys: Sequence[Key], places: Sequence[tuple[str, Sequence[int]]]) -> str:
+def _repetition(keys: Sequence[Key], places: Sequence[tuple[str, Sequence[int]]]) -> str:
     """Say which flow stands in a table twice."""
     line_of: dict[Key, int] = {}
     positions = ((name, line) for name, lines in places for line in lines)
@@ -143,10 +143,10 @@ def read_stocks(path: Path, unit: str) -> dict[tuple[str, str, int], float]:
         grid.require(("process", "year", "value", "unit"))
         factors = Memo[str, float](lambda text: factor(text.strip(), unit))
         for part in grid.parts():
-            years = part.converted(part.of("year"), Memo(_year))
+            years = part.convert(part.of("year"), Memo(_year))
             values, scales = (
                 part.numbers(grid.places["value"], part.of("value")),
-                part.converted(part.of("unit"), factors),
+                part.convert(part.of("unit"), factors),
             )
             cells = zip(part.of("region"), part.of("process"), years, part.lines, values, scales, strict=True)
             for region, process, year, line, value, scale in cells:
@@ -187,9 +187,9 @@ def _long(grid: Grid, default_year: int | None) -> Iterator[_Entries]:
     for part in grid.parts():
         year_of_row: Iterable[int] = itertools.repeat(default_year or 0, len(part.rows))
         if "year" in grid.places:
-            year_of_row = part.converted(part.of("year"), years)
-        region_of_row = part.converted(part.of("region"), regions)
-        keys = list(zip(region_of_row, year_of_row, part.converted(list(map(ends, part.rows)), pairs), strict=True))
+            year_of_row = part.convert(part.of("year"), years)
+        region_of_row = part.convert(part.of("region"), regions)
+        keys = list(zip(region_of_row, year_of_row, part.convert(list(map(ends, part.rows)), pairs), strict=True))
         values = part.numbers(grid.places["value"], part.of("value"))
         texts = part.of("unit")
         units = {unit or text.strip(): part.lines[texts.index(text)] for text in dict.fromkeys(texts)}
@@ -251,7 +251,7 @@ def _matrix(grid: Grid, default_year: int | None) -> Iterator[_Entries]:
                     lines.append(line)
                     ends.append((row[0], target))
                     values.append(value)
-        keys = [("", year, pair) for pair in GridPart(grid, lines, part.rows).converted(ends, pairs)]
+        keys = [("", year, pair) for pair in GridPart(grid, lines, part.rows).convert(ends, pairs)]
         yield _Entries(lines, keys, values, {"": lines[0]} if lines else {}, {})
 
 

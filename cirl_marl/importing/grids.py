@@ -48,7 +48,7 @@ class GridPart:
             return [""] * len(self.rows)
         return list(map(itemgetter(self.grid.places[key]), self.rows))
 
-    def converted(self, texts: Sequence[K], values: Memo[K, V]) -> list[V]:
+    def convert(self, texts: Sequence[K], values: Memo[K, V]) -> list[V]:
         """Return what the texts of each row mean; a ``CirlError`` of one that means nothing names its line as well."""
         try:
             return list(map(values.__getitem__, texts))
@@ -77,14 +77,14 @@ class GridPart:
 class Memo(dict[K, V]):
     """What texts mean, found once for each."""
 
-    def __init__(self, convert: Callable[[K], V]) -> None:
-        """Let ``convert`` find it."""
+    def __init__(self, meaning: Callable[[K], V]) -> None:
+        """Let ``meaning`` find it."""
         super().__init__()
-        self._convert = convert
+        self._meaning = meaning
 
     def __missing__(self, key: K) -> V:
         """Find what a text means."""
-        value = self[key] = self._convert(key)
+        value = self[key] = self._meaning(key)
         return value
 
 

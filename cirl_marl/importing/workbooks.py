@@ -43,8 +43,8 @@ def read_sheets(
     except ImportError:
         raise CirlError(f"{path}: to read workbooks: pip install 'cirl-marl[excel]', or save it as CSV") from None
 
-    def rows(name: str, *, computed: bool) -> list[Row]:
-        book = load_workbook(io.BytesIO(content), read_only=True, keep_links=False, data_only=computed)
+    def rows(name: str, *, data_only: bool) -> list[Row]:
+        book = load_workbook(io.BytesIO(content), read_only=True, keep_links=False, data_only=data_only)
         return list(_rows(book[name]))
 
     try:
@@ -54,9 +54,9 @@ def read_sheets(
             names = load_workbook(io.BytesIO(content), read_only=True, keep_links=False).sheetnames
             results = []
             for name in choose(names):
-                values = rows(name, computed=True)
+                values = rows(name, data_only=True)
                 if any(None in row for row in values):
-                    _check_formulas(f"{path}, sheet '{name}'", values, rows(name, computed=False))
+                    _check_formulas(f"{path}, sheet '{name}'", values, rows(name, data_only=False))
                 results.append((name, _block(values)))
             return results
     except CirlError:
