@@ -105,6 +105,8 @@ def main(count: int, seed: int) -> None:
     """Kill ``count`` trainings, of every kind in turn, and say how many ended with other bits."""
     draw, kills, saved, other, cases = random.Random(seed), 0, 0, 0, list[str]()
     with tempfile.TemporaryDirectory() as scratch:
+        for case in ("PPO", "SAC"):  # what is imported now is there in every child
+            begin_or_go_on(case, Path(scratch) / case)
         while kills < count:
             if not cases:
                 cases = [*CASES, TEAM]

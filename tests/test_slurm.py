@@ -252,7 +252,7 @@ def test_a_job_at_its_time_limit_goes_on(node: str, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_killed_drivers_change_nothing(node: str, bottles: Network, tmp_path: Path) -> None:
-    """Killed when jobs wait, when one trains and when one is done, and a job with it: the table is that of one place."""
+    """Killed when jobs wait, when one trains and when one is done, with its jobs: the table is that of ``local``."""
     if node == "accounting":
         pytest.skip("takes a minute, and is the same with accounting")
     assert bottles.source is not None
