@@ -23,7 +23,7 @@ ROWS = 2**20
 PROLOG = 2**16
 """Bytes within which the root of an XML file begins."""
 
-Row = Sequence[Any]
+SheetRow = Sequence[Any]
 
 
 def read_sheets(
@@ -43,7 +43,7 @@ def read_sheets(
     except ImportError:
         raise CirlError(f"{path}: to read workbooks: pip install 'cirl-marl[excel]', or save it as CSV") from None
 
-    def rows(name: str, *, data_only: bool) -> list[Row]:
+    def rows(name: str, *, data_only: bool) -> list[SheetRow]:
         book = load_workbook(io.BytesIO(content), read_only=True, keep_links=False, data_only=data_only)
         return list(_rows(book[name]))
 
@@ -90,7 +90,7 @@ def _check_prolog(name: str, content: bytes) -> None:
         raise ValueError(f"{name} declares a document type, or does not begin")
 
 
-def _rows(sheet: Any) -> Iterator[Row]:
+def _rows(sheet: Any) -> Iterator[SheetRow]:
     """Yield the rows of a sheet, each to its last cell that holds something."""
     sheet.reset_dimensions()  # what the file says of them may be wrong, or absurd
     cells = 0
@@ -104,7 +104,7 @@ def _rows(sheet: Any) -> Iterator[Row]:
         yield row[:end]
 
 
-def _check_formulas(subject: str, values: Sequence[Row], formulas: Sequence[Row]) -> None:
+def _check_formulas(subject: str, values: Sequence[SheetRow], formulas: Sequence[SheetRow]) -> None:
     """Refuse a sheet none of whose formulas has a value: a program wrote it, and nobody has computed it."""
     first = ""
     for line, (row, formula_row) in enumerate(zip(values, formulas, strict=True), 1):
@@ -117,7 +117,7 @@ def _check_formulas(subject: str, values: Sequence[Row], formulas: Sequence[Row]
         raise CirlError(f"{subject}, {first} has no value yet; open it in a spreadsheet program, and save it there")
 
 
-def _block(values: Sequence[Row]) -> Block:
+def _block(values: Sequence[SheetRow]) -> Block:
     """Return rows as texts, all as long as the longest, with the numbers of their lines."""
     width = max(map(len, values), default=0)
     texts = [["" if cell is None else str(cell) for cell in row] for row in values]
