@@ -9,7 +9,7 @@ import numpy as np
 
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network.compartment_model import CompartmentModel, OutflowModel, ReleasingModel, Vehicle
-from cirl_marl.network.declarations import bound_problems, default_of
+from cirl_marl.network.declarations import LARGEST, bound_problems, default_of
 from cirl_marl.network.elements import LAW_FIELDS, MAX_STEPS, Arc, Compartment, Control, ControlKind, Law, Node
 from cirl_marl.network.series import Series, extremes
 from cirl_marl.network.specification import Specification
@@ -25,8 +25,8 @@ SIDES = ("low", "neutral", "high")
 def node_problems(network: Specification, node: Node) -> Iterator[str]:
     """Yield every mistake in a node, but for its stock and lifetime."""
     low, high = node.initial or (0.0, 0.0)
-    if not (math.isfinite(low) and math.isfinite(high)) or low > high:
-        yield f"node '{node.id}': initial range [{low}, {high}] is empty or not finite"
+    if not -LARGEST <= low <= high <= LARGEST:
+        yield f"node '{node.id}': initial range [{low}, {high}] is empty or not finite, or beyond {LARGEST:g}"
     elif low < 0 and network.episode.solver != "euler":
         yield f"node '{node.id}': initial stock {low} is negative"
     yield from _common_problems(f"node '{node.id}'", node, network)
@@ -78,8 +78,8 @@ def _batch_problems(subject: str, arc: Arc, network: Specification, nodes: Mappi
     if not arc.by and (arc.rate or arc.port):
         yield f"{subject}: a schedule of batches takes no rate and no port"
     times = [time for time, _ in arc.batches]
-    if any(not (math.isfinite(value) and value >= 0) for pair in arc.batches for value in pair):
-        yield f"{subject}: times and masses of batches {arc.batches} must be finite and not negative"
+    if any(not 0 <= value <= LARGEST for pair in arc.batches for value in pair):
+        yield f"{subject}: times and masses of batches {arc.batches} must lie in [0, {LARGEST:g}]"
         return
     if math.isfinite(interval) and interval > 0:  # anything else is a problem of its own
         for label, time in [("delay", arc.delay), *(("batch at", time) for time in times)]:
@@ -129,8 +129,9 @@ def _common_problems(subject: str, compartment: Compartment, network: Specificat
     if len(compartment.inner) != len(states):
         yield f"{subject}: {len(compartment.inner)} initial ranges for the inner states {list(states)}"
     for low, high in compartment.inner:
-        if not (math.isfinite(low) and math.isfinite(high)) or low > high:
-            yield f"{subject}: initial range [{low}, {high}] of an inner state is empty or not finite"
+        if not -LARGEST <= low <= high <= LARGEST:
+            fault = f"is empty or not finite, or beyond {LARGEST:g}"
+            yield f"{subject}: initial range [{low}, {high}] of an inner state {fault}"
     if compartment.model is not None:
         yield from _model_problems(subject, compartment, compartment.model)
     if compartment.control is not None:
@@ -146,8 +147,8 @@ def _control_problems(
     low, neutral, high = (
         np.array(network.interval_means(bound)) for bound in (control.low, control.neutral, control.high)
     )
-    if not np.isfinite([low, neutral, high]).all():
-        yield f"{subject}: control bounds must be finite"
+    if not (np.abs([low, neutral, high]) <= LARGEST).all():
+        yield f"{subject}: control bounds must be finite, and at most {LARGEST:g} in size"
     elif not ((low <= neutral) & (neutral <= high)).all() or control.low == control.high:
         worst = int(np.argmax((low > neutral) | (neutral > high)))
         bounds = f"{low[worst]:g}, {neutral[worst]:g}, {high[worst]:g}{unit}"
