@@ -15,7 +15,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
-from test_jobs import wait_until
 from test_sweep import RECIPE, SWEEP
 from written_jobs import Exploding, written
 
@@ -270,7 +269,10 @@ def test_killed_drivers_change_nothing(node: str, bottles: Network, tmp_path: Pa
 
     for sign in ("jobs/.slurm-*/*.pkl", "jobs/*-quick-*.json", "cells/*/result.json"):
         driver = sweep("slurm")
-        wait_until(lambda pattern=sign: any((tmp_path / "slurm").glob(pattern)))
+        late = time.monotonic() + 600.0
+        while not any((tmp_path / "slurm").glob(sign)):
+            assert time.monotonic() < late and driver.poll() is None, sign
+            time.sleep(0.1)
         driver.kill()
         assert driver.wait() == -signal.SIGKILL
         subprocess.run(["scancel", "--me", "--state=RUNNING", "--signal=KILL"], check=True)
