@@ -90,6 +90,51 @@ def test_half_written_runs_are_refused(tmp_path: Path, ppo_recipe: Recipe, own_c
         Trained(directory)
 
 
+def test_what_a_kill_leaves_of_a_run_that_was_being_made(
+    tmp_path: Path, own_copper_run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At any operation on files: it is made anew. A folder with the definition of somebody is left alone."""
+    config, definition = RunDirectory(own_copper_run).config, own_copper_run / "network.toml"
+    operations = [(Path, "mkdir"), (Path, "write_text"), (Path, "replace"), (shutil, "copyfile")]
+    originals = [getattr(owner, name) for owner, name in operations]
+    left, kills, run = 0, 0, tmp_path / "made"
+
+    class Killed(BaseException):
+        """Ends a process in a test."""
+
+    def counted(original: Any, *args: Any, **options: Any) -> Any:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise Killed
+        return original(*args, **options)
+
+    def create(allowed: int) -> None:
+        nonlocal left
+        left = allowed
+        with monkeypatch.context() as patch:
+            for (owner, name), original in zip(operations, originals, strict=True):
+                patch.setattr(owner, name, lambda *args, original=original, **more: counted(original, *args, **more))
+            patch.setattr(Path, "unlink", lambda *_, **__: None)  # nobody clears up after a kill
+            RunDirectory.create(run, config, definition)
+
+    for allowed in range(100):
+        try:
+            create(allowed)
+            break
+        except Killed:
+            kills += 1
+            assert not (run / "config.json").is_file()
+            RunDirectory.create(run, config, definition)
+            assert RunDirectory(run).config.steps == config.steps
+            shutil.rmtree(run)
+    assert kills >= 8
+    (mine := tmp_path / "mine").mkdir()
+    shutil.copy(definition, mine)
+    with pytest.raises(RunError, match="already exists and is not empty"):
+        RunDirectory.create(mine, config, definition)
+
+
 def test_directories_without_a_run_are_named(tmp_path: Path) -> None:
     """With the runs beside them, if there are any."""
     (tmp_path / "runs" / "empty").mkdir(parents=True)

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from fuzz import fuzzed
 from some import some
 from test_own_models import brewery
@@ -31,6 +32,8 @@ from cirl_marl.network.units import factor
 
 pytestmark = pytest.mark.medium
 
+STOCKS: list[Any] = [True, np.ma.masked, torch.ones(1, requires_grad=True), "1", 1j]
+"""What is no stock."""
 SOURCES = Path(__file__).parent.parent / "cirl_marl"
 OPENERS = re.compile(
     r"\b(pickle|cloudpickle|dill|joblib|shelve|marshal)\b|torch\.load|allow_pickle|\.load_replay_buffer|VecNormalize\.load|\beval\(|\bexec\("
@@ -290,6 +293,10 @@ def test_what_is_no_network_agent_or_seed(tmp_path: Path) -> None:
         (lambda: MultiAgentVectorEnv(path, num_envs=1, agents=[["mine"]]), "agents must be a sequence of ids"),  # type: ignore[list-item]
         (lambda: env.restore(None), "a snapshot is needed"),  # type: ignore[arg-type]
         *((lambda seed=seed: alone.reset(seed=seed), "must be a non-negative integer") for seed in (-1, "a", 1.5, [1])),
+        *(
+            (lambda stock=stock: env.reset(options={"initial_state": {"mine": stock}}), "it must hold numbers")
+            for stock in STOCKS
+        ),
     ]
     for bad, said in wrong:
         with pytest.raises(CirlError, match=said):
@@ -305,6 +312,18 @@ def test_what_is_no_network_agent_or_seed(tmp_path: Path) -> None:
         path.write_text(line + "\n" + text)
         with pytest.raises(CirlError, match=said):
             load_network(path)
+
+
+def test_a_missing_file_is_all_that_is_told(tmp_path: Path) -> None:
+    """Nothing is said of numbers that could not be read from it."""
+    (path := tmp_path / "steel.toml").write_text((folder("envs") / "steel.toml").read_text())
+    with pytest.raises(CirlError) as refused:
+        load_network(f"{path}:japan")
+    lines = str(refused.value).splitlines()
+    assert [re.findall("'(steel.*?csv)': is not there", line) for line in lines] == [
+        ["steel_regions.csv"],
+        ["steel.csv"],
+    ]
 
 
 def test_figures_are_shown_where_they_cannot_be_kept(

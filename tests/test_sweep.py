@@ -78,6 +78,7 @@ def changed(file: Path, old: str, new: str) -> Path:
         ('"bottles.toml"', '"coper_net"', "networks: unknown network 'coper_net'. Did you mean 'copper_net'?"),
         ('"bottles.toml"', '"nowhere.toml"', "nowhere.toml: no such file"),
         ('"bottles.toml"', '"bottles.toml", "bottles.toml"', "networks: lists 'bottles.toml' twice"),
+        ("[options]", "[options]\nenvs = [1, true]", "options.envs, entry 2: must be a whole number, got True"),
         ('"quick.toml"', '"independent_aars"', "recipes: unknown recipe 'independent_aars'. Did you mean 'independ"),
         ('"quick.toml"', '""', "recipes: unknown recipe ''"),
         ("seeds = [0, 1]", "seeds = []", "seeds: lists nothing"),

@@ -122,12 +122,12 @@ class RunDirectory:
         except (TypeError, ValueError) as error:
             raise RunError(f"{run.path}: a run on disk needs a recipe of plain values: {error}") from error
         run.path.mkdir(parents=True, exist_ok=True)
+        write_json(run.path / "versions.json", versions())  # the first: by it one knows what a crash left
         folder = run.path / "network" if config.data_sha256 else run.path
         data = {name: definition.parent / name for name in config.data_sha256}
         for name, source in {"network.toml": definition, **data}.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, folder / name)
-        write_json(run.path / "versions.json", versions())
         run.set_status("running", 0, None)
         write_json(run.path / "config.json", plain)  # the last: with it the directory is a run
         return run
@@ -137,7 +137,8 @@ class RunDirectory:
         if self.path.is_symlink() or not self.path.is_dir():
             return False
         names = {entry.name for entry in self.path.iterdir()}
-        return "versions.json" in names and all(map(BEFORE_CONFIG.fullmatch, names))
+        is_ours = not names.isdisjoint({"versions.json", ".versions.partial.json"})
+        return is_ours and all(map(BEFORE_CONFIG.fullmatch, names))
 
     @contextmanager
     def lock(self) -> Iterator[None]:

@@ -28,7 +28,8 @@ def _as_list(value: Any) -> Any:
     entries = value if isinstance(value, list) else [value]
     if not entries:
         raise PydanticCustomError("nothing", "lists nothing")
-    twice = [entry for i, entry in enumerate(entries) if entry in entries[:i]]
+    typed = [(type(entry), entry) for entry in entries]  # true is not 1
+    twice = [entry for i, (_, entry) in enumerate(typed) if typed[i] in typed[:i]]
     if twice:
         raise PydanticCustomError("twice", "lists {value} twice", {"value": repr(twice[0])})
     return entries
