@@ -178,7 +178,7 @@ REFINERY = 'initial = { low = 60.0, high = 90.0, unit = "kt"'
             'delay = { value = 1, unit = "day", source = "x" }\n' + RATE,
             ["arc 'refinery_to_fabrication'", "delay = 1.0", "takes rate"],
         ),
-        ("[episode]", '[episode]\nsolver_step = { value = 1, unit = "day", source = "x" }', ["'exact'", "solver_step"]),
+        ("[episode]", '[episode]\nsolver_step = { value = 7, unit = "day", source = "x" }', ["solver steps of 7"]),
         ('quantity = "stock"', 'quantity = "stock"\nmeasure = "weight"', ["'copper_in_use'", "'weight'", "none"]),
         ("owed_by = [", 'owed_by = ["mine", "mine", ', ["'copper_in_use'", "owed_by", "'mine' twice"]),
         (RATE, RATE.replace("1/day", "kg"), ["arcs.refinery_to_fabrication.rate", "'kg'", "inconsistent"]),

@@ -218,7 +218,7 @@ def test_a_disturbed_network_is_the_network_of_its_path(network: Network, seed: 
     certain = MultiAgentVectorEnv(env.certain_network(1), num_envs=1, reward="mixed_difference")
     start = env.physical.stock[env.rows.nodes, 1].tolist()
     certain.reset(seed=0, options={"initial_state": dict(zip(env.rows.start_names, start, strict=True))})
-    same_steps = certain.dynamics.substeps == env.dynamics.substeps  # else another part of what is scheduled is cut
+    assert certain.dynamics.substeps == env.dynamics.substeps  # else another part of what is scheduled is cut
     rng, saved, seen = np.random.default_rng(seed), env.snapshot(), []
     entries = sum(space.shape[0] for space in env.action_spaces.values())
     mass = env.physical.stock[: env.rows.unit].sum(axis=0)
@@ -233,10 +233,9 @@ def test_a_disturbed_network_is_the_network_of_its_path(network: Network, seed: 
         np.testing.assert_allclose(env.physical.stock[: env.rows.unit].sum(axis=0), mass, rtol=1e-12)
         for space, row in zip(env.observation_spaces.values(), env.by_agent(outcome.observation).values(), strict=True):
             assert all(space.contains(copy) for copy in row)
-        if same_steps:
-            for what in ("flow", "circularity_mean", "levels", "reward", "local"):
-                ours, theirs = getattr(outcome, what)[..., 1], getattr(other, what)[..., 0]
-                np.testing.assert_allclose(ours, theirs, rtol=1e-8, atol=1e-8, err_msg=what)
+        for what in ("flow", "circularity_mean", "levels", "reward", "local"):
+            ours, theirs = getattr(outcome, what)[..., 1], getattr(other, what)[..., 0]
+            np.testing.assert_allclose(ours, theirs, rtol=1e-8, atol=1e-8, err_msg=what)
     env.restore(saved)
     for action, outcome in seen:
         np.testing.assert_array_equal(env.advance(np.repeat(action, 2, axis=1)).observation, outcome.observation)

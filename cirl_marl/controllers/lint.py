@@ -123,7 +123,7 @@ def _departures(network: Network) -> Iterator[str]:
 def _coarse(env: MultiAgentVectorEnv) -> Iterator[str]:
     """Yield what neutral control brings about otherwise with half the solver's step, and controls it cannot follow."""
     network, step = env.network, env.network.episode.solver_step
-    if step is None:
+    if step is None or network.episode.solver == "exact":
         return
     try:
         for action in (-1.0, 1.0):

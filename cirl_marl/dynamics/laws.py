@@ -155,10 +155,10 @@ class ArcRates:
                     f"{subject}; solver 'rk4' needs a solver_step of at most {MAX_TURNOVER / fastest:.4g} "
                     f"{network.time_unit}, not {step:g}"
                 )
+        stated = 1 if episode.solver_step is None else round(episode.control_interval / episode.solver_step)
         if episode.solver == "exact":
-            return max(1, math.ceil(fastest * episode.control_interval / MAX_TURNOVER - 1e-9))
-        assert episode.solver_step is not None
-        return round(episode.control_interval / episode.solver_step)
+            return max(stated, math.ceil(fastest * episode.control_interval / MAX_TURNOVER - 1e-9))
+        return stated
 
     def _rate_without_shares(self, controls: Floats) -> Floats:
         """Return r, but for shares and time series."""

@@ -313,13 +313,17 @@ class MultiAgentVectorEnv:
         return self.dynamics.factors(self.physical.factors, self.physical.disturbances, step)
 
     def certain_network(self, copy: int) -> Network:
-        """Return the network of the episode in a copy: certain, with all that it drew and that disturbs it."""
+        """Return the network of the episode in a copy: certain, with all that it drew and that disturbs it.
+
+        Its solver takes as many steps as here, as flows are cut in each of them to what their donors hold.
+        """
         if not self.dynamics.factors.ranges:
             return self.network
         state = self.physical
         path = state.disturbances[:-1, :, copy] if len(state.disturbances) else None
         network: Network = draw_network(self.network, state.factors[:, copy].tolist(), path)
-        return network
+        steps = {"solver_step": self.dynamics.substep} if self.dynamics.substeps > 1 else {}
+        return network.with_options(episode=steps)
 
     def stack(self, actions: Mapping[str, ArrayLike]) -> Floats:
         """Stack the actions of all agents, shape (entries, B); the checks of ``step`` apply."""

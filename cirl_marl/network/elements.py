@@ -411,7 +411,9 @@ class Episode(CheckedRecord):
     solver_step: Annotated[
         float | None,
         Quantity(
-            "step of the ``rk4`` and ``euler`` solvers, a whole fraction of the control interval", of="time", joint=True
+            "step of the ``rk4`` and ``euler`` solvers, a whole fraction of the control interval; of ``exact`` the longest",
+            of="time",
+            joint=True,
         ),
     ] = None
     start: Annotated[

@@ -21,11 +21,9 @@ def setting_problems(network: Specification) -> Iterator[str]:
     episode, objective = network.episode, network.objective
     for part in (episode, objective, network.observation):
         yield from bound_problems(part)
-    if episode.solver != "exact":
+    if episode.solver != "exact" or episode.solver_step is not None:
         yield from _step_problems(episode, network.time_unit)
-    else:
-        if episode.solver_step is not None:
-            yield f"solver 'exact' takes no solver_step, got {episode.solver_step}"
+    if episode.solver == "exact":
         continuous = any(isinstance(c.model, ContinuousModel | OwnStepModel) for c in (*network.nodes, *network.arcs))
         if continuous or any(arc.law is Law.COMPARTMENT for arc in network.arcs):
             yield "solver 'exact' knows no continuous inner physics: a network with models needs 'rk4' or 'euler'"
