@@ -216,7 +216,7 @@ def test_networks_without_services() -> None:
     """Any level is met, there are no rows for it, and episodes have the level 1."""
     still = replace(town(), services=())
     for options in ({}, {"min_service": 0.9}, {"service_weight": 2.0}):
-        found = bound(still, **options)  # type: ignore[arg-type]
+        found = bound(still, **options)  # type: ignore[call-overload]
         run = simulate_plan(improve_plan(found, rounds=2))
         assert (found.service, found.levels.shape, run.episode_levels.shape) == (1.0, (0,), (1, 0))
         assert run.least_service == run.episode_service == 1.0

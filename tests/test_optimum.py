@@ -596,7 +596,7 @@ def test_service_out_of_reach() -> None:
 def test_bad_input(options: dict[str, object], said: str) -> None:
     """Options that cannot be used are named."""
     with pytest.raises(CirlError, match=said):
-        bound(load_network("copper_net"), **options)  # type: ignore[arg-type]
+        bound(load_network("copper_net"), **options)  # type: ignore[call-overload]
 
 
 def test_near_bound_is_where_the_solver_starts() -> None:

@@ -411,7 +411,8 @@ class Episode(CheckedRecord):
     solver_step: Annotated[
         float | None,
         Quantity(
-            "step of the ``rk4`` and ``euler`` solvers, a whole fraction of the control interval; of ``exact`` the longest",
+            "step of the ``rk4`` and ``euler`` solvers, a whole fraction of the control interval; the longest "
+            "of ``exact``",
             of="time",
             joint=True,
         ),

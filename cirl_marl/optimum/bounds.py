@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,6 +28,7 @@ from cirl_marl.optimum.options import (
 )
 from cirl_marl.optimum.program import Program, Programs, circularity_weights
 from cirl_marl.optimum.solver import FEASIBLE, Basis, Infeasible, solve
+from cirl_marl.optimum.uncertain_bound import Sampling, UncertainBound, uncertain_bound
 
 
 def relative(difference: ArrayLike, reference: ArrayLike) -> Floats:
@@ -152,6 +153,7 @@ class Envelope:
         return bounds
 
 
+@overload
 def bound(
     network: str | Path | Network,
     initial: Mapping[str, float] | ArrayLike | None = None,
@@ -163,7 +165,37 @@ def bound(
     horizon: int | None = None,
     degree: int = DEGREE,
     near: Bound | None = None,
-) -> Bound:
+    uncertain: Literal[False] = False,
+) -> Bound: ...
+
+
+@overload
+def bound(
+    network: str | Path | Network,
+    initial: Mapping[str, float] | ArrayLike | None = None,
+    *,
+    min_service: ArrayLike | None = None,
+    agents: Sequence[str] | None = None,
+    scenario: str | None = None,
+    horizon: int | None = None,
+    degree: int = DEGREE,
+    uncertain: Literal[True] | Sampling,
+) -> UncertainBound: ...
+
+
+def bound(
+    network: str | Path | Network,
+    initial: Mapping[str, float] | ArrayLike | None = None,
+    *,
+    service_weight: float | None = None,
+    min_service: ArrayLike | None = None,
+    agents: Sequence[str] | None = None,
+    scenario: str | None = None,
+    horizon: int | None = None,
+    degree: int = DEGREE,
+    near: Bound | None = None,
+    uncertain: bool | Sampling = False,
+) -> Bound | UncertainBound:
     """Bound what any admissible actions can reach over one episode in the simulator.
 
     Without options the bound is on λ̄; with ``min_service`` on λ̄ of episodes in which each service has at least that
@@ -172,10 +204,13 @@ def bound(
     donors hold (docs/bound.md). Of a service with a finite upper end of its band the lower end alone counts, so the
     bound holds but may be loose.
 
+    With ``uncertain`` it is on the mean of λ̄ over all that may happen, of policies that do not know the future, and
+    ``min_service`` on the expected levels.
+
     Args:
         network: catalogue name, path of a definition file, or a network.
         initial: stocks at the start: node → stock, the rest in the middle of their ranges; or shape (stores,). None:
-            all in the middle.
+            all in the middle, or with ``uncertain`` drawn as episodes draw them.
         service_weight: w ≥ 0; excludes ``min_service``.
         min_service: in [0, 1], for every service, or one for each, shape (services,).
         agents: who acts; None is the network's own choice.
@@ -183,14 +218,24 @@ def bound(
         horizon: decisions per episode; None takes the definition's.
         degree: degree of the test polynomials, 1 or more; higher is tighter and slower.
         near: a bound of a similar program, from whose solution this one is reached sooner: another start or level.
+        uncertain: whether disturbances and uncertain numbers are drawn, and how if not by default; excludes
+            ``service_weight`` and ``near``.
 
     Raises:
         NoCertificate: for a network whose flows are not linear laws: inner physics, batches, inexact solvers.
         CirlError: for input that cannot be used, a service that no plan reaches (or only just, by less than the
-            solver's tolerance of 1e-7), or a solver that fails.
+            solver's tolerance of 1e-7), a solver that fails, or with ``uncertain`` too few draws, a program of a draw
+            that is too large, or a network without anything to draw.
     """
     check_options(service_weight, min_service, degree)
-    admissible = Admissible.of(_episode_network(network, scenario, horizon), agents)
+    definition = _episode_network(network, scenario, horizon)
+    if uncertain is not False:
+        if service_weight is not None or near is not None:
+            raise CirlError("uncertain: service_weight and near go with a certain future; demand min_service")
+        levels = None if min_service is None else demanded_levels(definition, min_service)
+        sampling = Sampling() if uncertain is True else uncertain
+        return uncertain_bound(definition, agents, initial, levels, degree, sampling)
+    admissible = Admissible.of(definition, agents)
     start = starting_stocks(admissible.lifetimes, initial)
     levels = None if min_service is None else demanded_levels(admissible.network, min_service)
     basis = None if near is None else near.basis

@@ -20,7 +20,7 @@ from cirl_marl.network import Floats
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.bounds import Bound
 from cirl_marl.optimum.matrices import Layout
-from cirl_marl.optimum.program import Program, Programs
+from cirl_marl.optimum.program import Program
 from cirl_marl.optimum.solver import solve
 
 WIDER = 10.0
@@ -95,45 +95,3 @@ def changes(bound: Bound, admissible: Admissible, variant: Program) -> Floats:
         by_interval += np.bincount(problem.interval_of_rows(rows), parts, steps)
     rise: Floats = variant.constant - problem.constant - by_interval
     return rise
-
-
-def of_stocks(bound: Bound, programs: Programs) -> Floats:
-    """Return how much the objective of a bound rises for a unit of mass more in a stock, new at the start of intervals.
-
-    Of a node with a lifetime it is new as well: it leaves as what has just entered does. What more of a stock changes
-    in boxes and in the envelopes of products is left out.
-
-    Args:
-        bound: the bound of a whole episode, resting on rows.
-        programs: what its program was made by, or made alike.
-
-    Returns:
-        Shape (steps, stores), 1.
-    """
-    problem, lifetimes = bound.problem, programs.admissible.lifetimes
-    y, mu = bound.certificate.equal, np.minimum(bound.certificate.under, 0.0)
-    plan_network, steps = problem.layout.network, programs.admissible.network.episode.horizon
-    worth, tops = np.empty((steps, len(plan_network.stores))), [0, 0]
-    for step in range(steps):
-        # a stock s at the start stands on the left as B s, so a unit more lowers the right-hand side by B
-        blocks = programs.rows_at_start(step)
-        worth[step] = sum(
-            block.T @ multipliers[top : top + block.shape[0]]
-            for block, multipliers, top in zip(blocks, (y, mu), tops, strict=True)
-        )
-        tops = [top + block.shape[0] for top, block in zip(tops, blocks, strict=True)]
-    last = len(mu) - (0 if bound.min_service is None else len(plan_network.services))
-    for passive in reversed(lifetimes.passive):
-        out = lifetimes.of_new(passive, problem.layout)
-        rows = out.shape[1]
-        above, below = mu[last - 2 * rows : last - rows], mu[last - rows : last]
-        worth[:, plan_network.node_index[passive.node.id]] -= out @ (above - below)
-        last -= 2 * rows
-    of_nodes = worth[:, : len(lifetimes.network.stores)].copy()
-    stages = getattr(plan_network, "stages", {})
-    for i, node in enumerate(lifetimes.network.stores):
-        if len(stages.get(node.id, ())) > 1 and node.lifetime is not None and node.lifetime.chain is not None:
-            shares = node.lifetime.chain.inflow_shares
-            columns = [plan_network.node_index[stage] for stage in stages[node.id]]
-            of_nodes[:, i] = worth[:, columns] @ (shares / shares.sum())
-    return of_nodes

@@ -17,7 +17,8 @@ from cirl_marl.network.series import in_intervals
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.bounds import Bound, bound, highest_service
 from cirl_marl.optimum.program import Programs
-from cirl_marl.optimum.sensitivity import changes, of_stocks, resting_on_rows
+from cirl_marl.optimum.sensitivity import changes, resting_on_rows
+from cirl_marl.optimum.stock_values import stock_values
 
 PERCENT = 0.01
 DIFFERENCE = 1e-5
@@ -107,10 +108,11 @@ def shadow_prices(
             room[side, :, a] = _worth_of_room(best, admissible, agent, side)
             progress(next(shares))
     # the last rows of the program hold each service to its level
+    demands = 0 if best.min_service is None else services
     level = best.certificate.under[len(best.certificate.under) - services :]
     return ShadowPrices(
         bound=best,
-        stock=of_stocks(best, programs),
+        stock=stock_values(programs, best.problem, best.certificate, demands=demands),
         demand=demand,
         level=np.minimum(level, 0.0) if best.min_service is not None else np.zeros(services),
         room=room,

@@ -1,0 +1,192 @@
+"""What episodes of an uncertain network draw, and the program of one draw under a penalty on foresight."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Annotated
+
+import numpy as np
+
+from cirl_marl.environments.vector import MultiAgentVectorEnv
+from cirl_marl.network import Floats, Network
+from cirl_marl.network.declarations import positional_record
+from cirl_marl.network.innovations import innovations
+from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.certificate import Certificate, verify
+from cirl_marl.optimum.program import Program, Programs
+from cirl_marl.optimum.solver import Basis, Infeasible, SolverFailure, solve
+from cirl_marl.optimum.stock_values import stock_values
+
+MEMORIES = (0.7, 0.95)
+"""Shares of means of the past that are left after an interval."""
+
+
+@positional_record
+class Draw:
+    """One future: all that an episode draws."""
+
+    network: Annotated[Network, "what is certain then: its own rates, shares, demands and lifetimes"]
+    initial: Annotated[Floats, "stocks at the start, those with a lifetime by stage, mass"]
+    features: Annotated[Floats, "functions φ(s_t) of the states of the disturbances, shape (steps, functions)"]
+    new: Annotated[Floats, "φ(s_{t+1}) less its mean given F_t, shape (steps − 1, functions)"]
+
+
+def draws_of(env: MultiAgentVectorEnv, initial: Floats | None = None) -> list[Draw]:
+    """Return what the episodes in the copies of an environment draw; with ``initial`` all start from there."""
+    state, last = env.physical, env.network.episode.horizon
+    processes = env.network.processes
+    parts = innovations(processes, state.processes[:last] if processes.names else np.empty((last, 0, env.num_envs)))
+    starts = state.stock[env.rows.nodes].T.copy()
+    return [
+        Draw(env.certain_network(i), start if initial is None else initial, parts.features[..., i], parts.new[..., i])
+        for i, start in enumerate(starts)
+    ]
+
+
+@positional_record
+class Prices:
+    """What takes the use out of foresight: prices on stocks by what is new, and on the services.
+
+    The price on what a stock differs from what was to be expected of it at the start of interval t + 1 is Σ_f
+    θ_tf·(φ_f(s_{t+1}) − E[φ_f(s_{t+1}) | F_t]), with θ linear in t between knots. As what was to be expected follows
+    from F_t, it changes no mean; it spares the means of draws their noise.
+    """
+
+    stock: Annotated[Floats, "θ at the knots, shape (knots, stores, functions), objective/mass"]
+    reference: Annotated[Floats, "what is expected of stocks but for disturbances, shape (steps − 1, stores), mass"]
+    response: Annotated[Floats, "what past disturbances add to it, of ``past_of`` them, shape (functions', stores)"]
+    service: Annotated[Floats, "μ ≥ 0 of the mean level of each service, shape (services,)"]
+    demand: Annotated[Floats, "the expected level demanded of each, shape (services,)"]
+
+    def weights(self, new: Floats) -> Floats:
+        """Return the price on each stock at the start of intervals 1, 2, …, shape (steps − 1, stores).
+
+        Args:
+            new: what is new in a draw, shape (steps − 1, functions).
+        """
+        at_knots = np.einsum("knf,tf->tkn", self.stock, new)
+        return np.asarray(np.einsum("tk,tkn->tn", knot_weights(len(new), len(self.stock)), at_knots))
+
+    def expected(self, features: Floats) -> Floats:
+        """Return what is expected of stocks at the start of intervals 1, 2, …, shape (steps − 1, stores), mass."""
+        return np.asarray(self.reference + past_of(features) @ self.response)
+
+    def service_value(self, levels: Floats) -> Floats:
+        """Return Σ_s μ_s (level_s − demand_s) of mean levels, shape (..., services)."""
+        return np.asarray((levels - self.demand) @ self.service)
+
+
+def past_of(features: Floats) -> Floats:
+    """Return what is known of disturbances in t, for t = 0 … steps − 2: φ(s_t), and means of it that forget.
+
+    Args:
+        features: φ(s_t), shape (steps, functions).
+
+    Returns:
+        Shape (steps − 1, 3·functions).
+    """
+    known, means = features[:-1], [features[:-1]]
+    for memory in MEMORIES:
+        mean = np.zeros_like(known)
+        for t, now in enumerate(known):
+            mean[t] = now if t == 0 else memory * mean[t - 1] + (1 - memory) * now
+        means.append(mean)
+    return np.concatenate(means, axis=1)
+
+
+def knot_weights(steps: int, knots: int) -> Floats:
+    """Return how much each of some evenly spaced knots counts in each step, shape (steps, knots)."""
+    place = np.linspace(0.0, knots - 1.0, steps) if knots > 1 else np.zeros(steps)
+    return np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(knots)))
+
+
+@positional_record
+class DrawProof:
+    """What is proved of a draw."""
+
+    value: Annotated[float, "what no actions exceed there, penalty included"]
+    certificate: Certificate
+    plan: Annotated[Floats | None, "the variables of the program; None if nothing solved it"]
+    basis: Annotated[Basis | None, "from which the program under other prices may be solved"]
+
+
+class DrawProgram:
+    """The program of a draw: its own rows, boxes and kernels; prices change its costs alone."""
+
+    def __init__(
+        self, draw: Draw, agents: Sequence[str] | None, degree: int, service_weight: float | None = None
+    ) -> None:
+        """Write the rows down.
+
+        Raises:
+            NoCertificate: for a network whose flows are not linear laws.
+        """
+        admissible = Admissible.of(draw.network, agents)
+        self.draw, self._totals = draw, admissible.lifetimes.totals
+        self._programs = Programs(admissible, degree, service_weight)
+        self.problem = self._programs.program(draw.initial)
+        self.layout = self.problem.layout
+
+    def priced(self, prices: Prices) -> Program:
+        """Return the program under ``prices``."""
+        weights = prices.weights(self.draw.new)
+        return self.weighted(weights, float((weights * prices.expected(self.draw.features)).sum()), prices)
+
+    def weighted(self, weights: Floats, constant: float, prices: Prices) -> Program:
+        """Return the program with ``weights`` on stocks at the start of intervals 1, 2, …, shape (steps − 1, stores).
+
+        ``constant`` is what the objective has more, beside what the demand on services costs.
+        """
+        problem, layout = self.problem, self.layout
+        cost = problem.cost.reshape(-1, layout.size).copy()
+        cost[:-1, layout.last] += weights @ self._totals
+        cost[:, layout.level : layout.imbalance] -= prices.service / len(cost)
+        constant = problem.constant + constant - float(prices.service @ prices.demand)
+        return replace(problem, cost=cost.ravel(), constant=constant)
+
+    def prove(self, problem: Program, basis: Basis | None = None, others: Sequence[Certificate] = ()) -> DrawProof:
+        """Solve the program under some prices, and return what its multipliers prove.
+
+        Where the solver fails, the best of what ``others`` prove here, or no multipliers at all, takes the place.
+        ``basis`` may be that of another draw, if its program has as many rows.
+        """
+        if basis is not None and (len(basis.columns), len(basis.rows)) != self._size:
+            basis = None
+        try:
+            solution = solve(problem, basis, label="the program of a draw", same_rows=basis is not None)
+        except (SolverFailure, Infeasible):
+            certificates = [self.no_multipliers, *(other for other in others if self._fits(other))]
+            proofs = [verify(problem, certificate, np.zeros(len(problem.cost))).bound for certificate in certificates]
+            best = int(np.argmin(proofs))
+            return DrawProof(proofs[best], certificates[best], None, None)
+        value = verify(problem, solution.certificate, solution.plan).bound
+        return DrawProof(value, solution.certificate, solution.plan, solution.basis)
+
+    @property
+    def _size(self) -> tuple[int, int]:
+        """Variables and rows."""
+        return len(self.problem.cost), len(self.problem.equal_to) + len(self.problem.under_to)
+
+    @property
+    def no_multipliers(self) -> Certificate:
+        """Multipliers 0 of all rows, which prove what the boxes allow."""
+        return Certificate(equal=np.zeros(len(self.problem.equal_to)), under=np.zeros(len(self.problem.under_to)))
+
+    def _fits(self, certificate: Certificate) -> bool:
+        sizes = len(self.problem.equal_to), len(self.problem.under_to)
+        return (len(certificate.equal), len(certificate.under)) == sizes
+
+    def stocks(self, plan: Floats) -> Floats:
+        """Return the stocks at the start of intervals 1, 2, … under a plan, shape (steps − 1, stores), mass."""
+        ends = plan.reshape(-1, self.layout.size)[:-1, self.layout.last]
+        return np.asarray(ends @ self._totals.T)
+
+    def levels(self, plan: Floats) -> Floats:
+        """Return the mean level of each service under a plan, shape (services,)."""
+        layout = self.layout
+        return np.asarray(plan.reshape(-1, layout.size)[:, layout.level : layout.imbalance].mean(axis=0))
+
+    def stock_values(self, certificate: Certificate) -> Floats:
+        """Return what a mass more in a stock at the start of intervals 1, 2, … is worth, shape (steps − 1, stores)."""
+        return stock_values(self._programs, self.problem, certificate)[1:]

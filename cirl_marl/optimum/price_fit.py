@@ -1,0 +1,272 @@
+"""Prices that leave a clairvoyant little use of foresight, fitted to draws of their own.
+
+What stocks are worth in the optima of some draws is regressed on the states of the disturbances, again and again under
+the prices found so far. How much of each price is charged, and the prices on services, are then improved by cutting
+planes in a box: what is proved on average is convex in them, and every optimum gives a subgradient. Draws kept apart
+choose among all that was tried. Whatever prices come out, what they prove of other draws is a bound.
+
+References: Brown and Smith 2014, Information relaxations, duality, and convex stochastic dynamic programs (gradients as
+penalties); Marsten, Hogan and Blankenship 1975, The boxstep method for large-scale optimization.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import optimize, sparse
+
+from cirl_marl.errors import CirlError
+from cirl_marl.network import Floats
+from cirl_marl.network.declarations import positional_record
+from cirl_marl.optimum.certificate import Certificate
+from cirl_marl.optimum.draws import DrawProgram, DrawProof, Prices, knot_weights, past_of
+from cirl_marl.optimum.solver import Basis
+
+KNOTS = 3
+"""Times between which prices are linear."""
+REGRESSIONS = 2
+CUTS = 10
+"""Rounds of cutting planes, each of which solves every draw."""
+RIDGE = 1e-3
+"""Penalty on the coefficients of the regression, relative to the variance of what they multiply."""
+WORTHWHILE = 0.1
+"""Share of the fall that the cuts promise, at which a step is taken."""
+FIRST_RADIUS = 0.5
+"""Half of the first box, relative to the prices on stocks and to the objective."""
+MOST_PARTS = 32
+"""Parts of the prices on stocks that are improved one by one."""
+SHORT, OUT_OF_REACH = 1e-3, 20.0
+"""How far a service lacks, at which price relative to the objective, that no policy reaches."""
+SETTLED = 1e-6
+"""Relative fall that is promised below which no more cuts are made."""
+
+
+@positional_record
+class Trial:
+    """What prices prove of some draws."""
+
+    prices: Prices
+    proofs: tuple[DrawProof, ...]
+
+    @property
+    def values(self) -> Floats:
+        """Of each draw, shape (draws,)."""
+        return np.array([proof.value for proof in self.proofs])
+
+
+class Sample:
+    """Programs of draws, solved again and again under other prices."""
+
+    def __init__(self, programs: Sequence[DrawProgram]) -> None:
+        """Take them."""
+        self.programs = tuple(programs)
+        self._bases: list[Basis | None] = [None] * len(programs)
+
+    def __call__(self, prices: Prices) -> Trial:
+        """Solve all of them, each from where it was solved last, the first time from where the one before it was."""
+        proofs, basis = [], None
+        for i, program in enumerate(self.programs):
+            proof = program.prove(program.priced(prices), self._bases[i] or basis)
+            self._bases[i] = basis = proof.basis or self._bases[i]
+            proofs.append(proof)
+        return Trial(prices, tuple(proofs))
+
+    def reference(self, trial: Trial) -> tuple[Floats, Floats]:
+        """Return what is to be expected of stocks under the plans of a trial: ``reference`` and ``response``."""
+        stocks = np.array([program.stocks(plan) for program, plan, _ in self._solved(trial)])
+        past = np.array([past_of(program.draw.features) for program in self.programs])
+        mean = past.mean(axis=0)
+        response = _regression((past - mean).reshape(-1, past.shape[2]), stocks - stocks.mean(axis=0))
+        return stocks.mean(axis=0) - mean @ response, response
+
+    def levels(self, trial: Trial) -> Floats:
+        """Return the levels of each draw, shape (draws, services)."""
+        return np.array([program.levels(plan) for program, plan, _ in self._solved(trial)])
+
+    def slopes(self, trial: Trial) -> tuple[Floats, Floats]:
+        """Return subgradients of ``values``: by θ, (draws, knots, stores, functions), and by μ, (draws, services)."""
+        prices, by_stock = trial.prices, []
+        for program, plan, _ in self._solved(trial):
+            apart = program.stocks(plan) - prices.expected(program.draw.features)
+            new, knots = program.draw.new, knot_weights(len(apart), len(prices.stock))
+            by_stock.append(-np.einsum("tk,tn,tf->knf", knots, apart, new))
+        return np.array(by_stock), self.levels(trial) - prices.demand
+
+    def regression(self, trial: Trial) -> Floats:
+        """Return θ such that Σ_f θ_tf φ_f(s_t) is what stocks are worth, as near as it can be, by least squares."""
+        worth = np.array([program.stock_values(certificate) for program, _, certificate in self._solved(trial)])
+        features = np.array([program.draw.features[1:] for program in self.programs])
+        worth, features = worth - worth.mean(axis=0), features - features.mean(axis=0)
+        knots = knot_weights(worth.shape[1], len(trial.prices.stock))
+        shape = len(trial.prices.stock), features.shape[2]
+        table = np.einsum("itf,tk->itkf", features, knots).reshape(-1, shape[0] * shape[1])
+        return np.moveaxis(_regression(table, worth).reshape(*shape, -1), 1, 2)
+
+    def _solved(self, trial: Trial) -> list[tuple[DrawProgram, Floats, Certificate]]:
+        solutions = []
+        for program, proof in zip(self.programs, trial.proofs, strict=True):
+            if proof.plan is None:
+                name = program.draw.network.name
+                raise CirlError(
+                    f"network '{name}': HiGHS fails in a draw to which prices are fitted; take another seed"
+                )
+            solutions.append((program, proof.plan, proof.certificate))
+        return solutions
+
+
+def fit_prices(
+    programs: Sequence[DrawProgram],
+    demand: Floats,
+    scale: float,
+    *,
+    progress: Callable[[float], None] = lambda share: None,
+) -> tuple[Prices, Prices]:
+    """Return prices on services alone, for who knows the future, and on stocks and services for who does not.
+
+    Args:
+        programs: of the draws; every other one chooses among what the rest suggests.
+        demand: expected level demanded of each service, shape (services,); empty if nothing is demanded.
+        scale: size of the objective, from which prices on services start.
+        progress: called with the share that is done.
+
+    Raises:
+        CirlError: if not even who knows the future reaches the demanded levels in these draws.
+    """
+    first = programs[0].draw
+    steps, functions = first.new.shape
+    stores, services = len(first.network.stores), len(first.network.services)
+    free = Prices(
+        stock=np.zeros((KNOTS, stores, functions)),
+        reference=np.zeros((steps, stores)),
+        response=np.zeros((past_of(first.features).shape[1], stores)),
+        service=np.zeros(services),
+        demand=demand if len(demand) else np.zeros(services),
+    )
+    sample, judges = Sample(programs[::2]), Sample(programs[1::2])
+    trial, no_parts = sample(free), np.zeros((0, *free.stock.shape))
+    if len(demand):
+        trial = improve(sample, [trial], no_parts, scale)[-1]
+        _check_reach(sample, trial, scale)
+    progress(0.3)
+    informed, trials = trial.prices, [trial]
+    if functions:
+        # while nothing is charged, the stocks from which it counts do not matter
+        reference, response = sample.reference(trial)
+        trials = [replace(trial, prices=replace(informed, reference=reference, response=response))]
+        for _ in range(REGRESSIONS):
+            trials.append(sample(replace(trials[0].prices, stock=sample.regression(trials[-1]))))
+        progress(0.5)
+        trials += improve(sample, [trials[0], trials[-1]], _parts(trials[-1].prices.stock), scale, len(demand) > 0)
+        progress(0.8)
+    means = [judges(trial.prices).values.mean() for trial in trials]
+    progress(1.0)
+    return informed, trials[int(np.argmin(means))].prices
+
+
+def _check_reach(sample: Sample, trial: Trial, scale: float) -> None:
+    """Refuse levels that are missed at any price."""
+    prices, levels = trial.prices, sample.levels(trial).mean(axis=0)
+    for s in np.flatnonzero((levels < prices.demand - SHORT) & (prices.service > OUT_OF_REACH * scale)).tolist():
+        name = sample.programs[0].draw.network.services[s].id
+        raise CirlError(
+            f"no policy reaches an expected level of {prices.demand[s]:g} of '{name}' (at most {levels[s]:.6g} in "
+            f"{len(sample.programs)} draws)"
+        )
+
+
+def improve(
+    sample: Sample, trials: Sequence[Trial], parts: Floats, scale: float, has_demand: bool = True
+) -> list[Trial]:
+    """Lower the mean of what is proved by cutting planes in a box around the best prices so far.
+
+    Args:
+        sample: the draws.
+        trials: where to begin: without prices on stocks, and with the sum of all parts.
+        parts: of the prices on stocks; how much of each is charged is what is improved, (parts, *θ.shape).
+        scale: of the objective.
+        has_demand: whether prices on services may change.
+
+    Returns:
+        Trials each of which was better than all before, the best last.
+    """
+    count, cuts = len(parts), _Cuts(len(parts) + len(trials[0].prices.service))
+    places = [np.concatenate([np.full(count, float(i)), trial.prices.service]) for i, trial in enumerate(trials)]
+    for trial, at in zip(trials, places, strict=True):
+        cuts.add(sample, trial, parts, at)
+    first = int(np.argmin([trial.values.mean() for trial in trials]))
+    best, best_at = trials[first], places[first]
+    width = np.concatenate([np.ones(count), np.full(len(best_at) - count, scale if has_demand else 0.0)])
+    accepted, radius = [best], FIRST_RADIUS
+    for _ in range(CUTS):
+        box = np.stack([best_at - radius * width, best_at + radius * width])
+        box[0, count:] = np.maximum(box[0, count:], 0.0)
+        at, promised = cuts.lowest(box)
+        fall = best.values.mean() - promised
+        if fall <= SETTLED * scale:
+            break
+        prices = replace(best.prices, stock=np.einsum("p,pknf->knf", at[:count], parts), service=at[count:])
+        trial = sample(prices)
+        cuts.add(sample, trial, parts, at)
+        gained = best.values.mean() - trial.values.mean()
+        radius *= 2.0 if gained > 0.5 * fall else 1.0 if gained > WORTHWHILE * fall else 0.5
+        if gained > 0:
+            best, best_at = trial, at
+            accepted.append(trial)
+    return accepted
+
+
+class _Cuts:
+    """For each draw the planes below what is proved of it, which is convex in the prices."""
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._slopes: list[Floats] = []
+        self._offsets: list[Floats] = []
+
+    def add(self, sample: Sample, trial: Trial, parts: Floats, at: Floats) -> None:
+        """Add the planes that touch it at a trial."""
+        by_stock, by_service = sample.slopes(trial)
+        slopes = np.concatenate([np.einsum("iknf,pknf->ip", by_stock, parts), by_service], axis=1)
+        self._slopes.append(slopes)
+        self._offsets.append(trial.values - slopes @ at)
+
+    def lowest(self, box: Floats) -> tuple[Floats, float]:
+        """Return where in a box, shape (2, size), the mean of the highest plane of each draw is least, and this."""
+        slopes, offsets = np.concatenate(self._slopes), np.concatenate(self._offsets)
+        draws = len(self._offsets[0])
+        # minimise the mean of η_i subject to slope·y + offset ≤ η_i
+        above = -sparse.vstack([sparse.eye_array(draws)] * len(self._offsets))
+        solution = optimize.linprog(
+            np.concatenate([np.zeros(self._size), np.full(draws, 1.0 / draws)]),
+            A_ub=sparse.hstack([sparse.csr_array(slopes), above], format="csr"),
+            b_ub=-offsets,
+            bounds=[*box.T.tolist(), *[(None, None)] * draws],
+        )
+        if solution.x is None:
+            raise CirlError(f"HiGHS did not solve the program of the prices: {solution.message}")
+        return solution.x[: self._size], float(solution.fun)
+
+
+def _regression(table: Floats, target: Floats) -> Floats:
+    """Return the coefficients of the columns of a table by ridge regression, (columns, …); of those that are 0 none."""
+    size = table.std(axis=0)
+    table = np.divide(table, size, out=np.zeros_like(table), where=size > 0)
+    normal = table.T @ table + RIDGE * len(table) * np.eye(table.shape[1])
+    solution = np.linalg.solve(normal, table.T @ target.reshape(len(table), -1))
+    coefficients: Floats = np.divide(solution, size[:, None], out=np.zeros_like(solution), where=size[:, None] > 0)
+    return coefficients
+
+
+def _parts(theta: Floats) -> Floats:
+    """Return θ as a sum of parts by stock and function, or if these are many by function, (parts, knots, stores, …)."""
+    _, stores, functions = theta.shape
+    by_stock = stores * functions <= MOST_PARTS
+    places = np.ndindex(stores, functions) if by_stock else ((slice(None), f) for f in range(functions))
+    parts = []
+    for store, function in places:
+        part = np.zeros_like(theta)
+        part[:, store, function] = theta[:, store, function]
+        parts.append(part)
+    return np.array([part for part in parts if part.any()]).reshape(-1, *theta.shape)
