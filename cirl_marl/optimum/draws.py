@@ -68,7 +68,7 @@ class Prices:
         at_knots = np.einsum("knf,tf->tkn", self.stock, new)
         return np.asarray(np.einsum("tk,tkn->tn", knot_weights(len(new), len(self.stock)), at_knots))
 
-    def expected(self, features: Floats) -> Floats:
+    def expected_stocks(self, features: Floats) -> Floats:
         """Return what is expected of stocks at the start of intervals 1, 2, …, shape (steps − 1, stores), mass."""
         return np.asarray(self.reference + past_of(features) @ self.response)
 
@@ -86,10 +86,10 @@ def past_of(features: Floats) -> Floats:
     Returns:
         Shape (steps − 1, 3·functions).
     """
-    known, means = features[:-1], [features[:-1]]
+    latest, means = features[:-1], [features[:-1]]
     for memory in MEMORIES:
-        mean = np.zeros_like(known)
-        for t, now in enumerate(known):
+        mean = np.zeros_like(latest)
+        for t, now in enumerate(latest):
             mean[t] = now if t == 0 else memory * mean[t - 1] + (1 - memory) * now
         means.append(mean)
     return np.concatenate(means, axis=1)
@@ -128,12 +128,12 @@ class DrawProgram:
         self.problem = self._programs.program(draw.initial)
         self.layout = self.problem.layout
 
-    def priced(self, prices: Prices) -> Program:
+    def with_prices(self, prices: Prices) -> Program:
         """Return the program under ``prices``."""
         weights = prices.weights(self.draw.new)
-        return self.weighted(weights, float((weights * prices.expected(self.draw.features)).sum()), prices)
+        return self.with_weights(weights, float((weights * prices.expected_stocks(self.draw.features)).sum()), prices)
 
-    def weighted(self, weights: Floats, constant: float, prices: Prices) -> Program:
+    def with_weights(self, weights: Floats, constant: float, prices: Prices) -> Program:
         """Return the program with ``weights`` on stocks at the start of intervals 1, 2, …, shape (steps − 1, stores).
 
         ``constant`` is what the objective has more, beside what the demand on services costs.
@@ -145,10 +145,10 @@ class DrawProgram:
         constant = problem.constant + constant - float(prices.service @ prices.demand)
         return replace(problem, cost=cost.ravel(), constant=constant)
 
-    def prove(self, problem: Program, basis: Basis | None = None, others: Sequence[Certificate] = ()) -> DrawProof:
+    def prove(self, problem: Program, basis: Basis | None = None, substitutes: Sequence[Certificate] = ()) -> DrawProof:
         """Solve the program under some prices, and return what its multipliers prove.
 
-        Where the solver fails, the best of what ``others`` prove here, or no multipliers at all, takes the place.
+        Where the solver fails, the best of what ``substitutes`` prove here, or no multipliers at all, takes the place.
         ``basis`` may be that of another draw, if its program has as many rows.
         """
         if basis is not None and (len(basis.columns), len(basis.rows)) != self._size:
@@ -156,7 +156,7 @@ class DrawProgram:
         try:
             solution = solve(problem, basis, label="the program of a draw", same_rows=basis is not None)
         except (SolverFailure, Infeasible):
-            certificates = [self.no_multipliers, *(other for other in others if self._fits(other))]
+            certificates = [self.no_multipliers, *(item for item in substitutes if self._fits(item))]
             proofs = [verify(problem, certificate, np.zeros(len(problem.cost))).bound for certificate in certificates]
             best = int(np.argmin(proofs))
             return DrawProof(proofs[best], certificates[best], None, None)

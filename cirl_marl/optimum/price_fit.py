@@ -39,7 +39,7 @@ MOST_PARTS = 32
 """Parts of the prices on stocks that are improved one by one."""
 SHORT, OUT_OF_REACH = 1e-3, 20.0
 """How far a service lacks, at which price relative to the objective, that no policy reaches."""
-SETTLED = 1e-6
+LEAST_FALL = 1e-6
 """Relative fall that is promised below which no more cuts are made."""
 
 
@@ -68,14 +68,14 @@ class Sample:
         """Solve all of them, each from where it was solved last, the first time from where the one before it was."""
         proofs, basis = [], None
         for i, program in enumerate(self.programs):
-            proof = program.prove(program.priced(prices), self._bases[i] or basis)
+            proof = program.prove(program.with_prices(prices), self._bases[i] or basis)
             self._bases[i] = basis = proof.basis or self._bases[i]
             proofs.append(proof)
         return Trial(prices, tuple(proofs))
 
     def reference(self, trial: Trial) -> tuple[Floats, Floats]:
         """Return what is to be expected of stocks under the plans of a trial: ``reference`` and ``response``."""
-        stocks = np.array([program.stocks(plan) for program, plan, _ in self._solved(trial)])
+        stocks = np.array([program.stocks(plan) for program, plan, _ in self._optima(trial)])
         past = np.array([past_of(program.draw.features) for program in self.programs])
         mean = past.mean(axis=0)
         response = _regression((past - mean).reshape(-1, past.shape[2]), stocks - stocks.mean(axis=0))
@@ -83,20 +83,20 @@ class Sample:
 
     def levels(self, trial: Trial) -> Floats:
         """Return the levels of each draw, shape (draws, services)."""
-        return np.array([program.levels(plan) for program, plan, _ in self._solved(trial)])
+        return np.array([program.levels(plan) for program, plan, _ in self._optima(trial)])
 
     def slopes(self, trial: Trial) -> tuple[Floats, Floats]:
         """Return subgradients of ``values``: by θ, (draws, knots, stores, functions), and by μ, (draws, services)."""
         prices, by_stock = trial.prices, []
-        for program, plan, _ in self._solved(trial):
-            apart = program.stocks(plan) - prices.expected(program.draw.features)
+        for program, plan, _ in self._optima(trial):
+            apart = program.stocks(plan) - prices.expected_stocks(program.draw.features)
             new, knots = program.draw.new, knot_weights(len(apart), len(prices.stock))
             by_stock.append(-np.einsum("tk,tn,tf->knf", knots, apart, new))
         return np.array(by_stock), self.levels(trial) - prices.demand
 
     def regression(self, trial: Trial) -> Floats:
         """Return θ such that Σ_f θ_tf φ_f(s_t) is what stocks are worth, as near as it can be, by least squares."""
-        worth = np.array([program.stock_values(certificate) for program, _, certificate in self._solved(trial)])
+        worth = np.array([program.stock_values(certificate) for program, _, certificate in self._optima(trial)])
         features = np.array([program.draw.features[1:] for program in self.programs])
         worth, features = worth - worth.mean(axis=0), features - features.mean(axis=0)
         knots = knot_weights(worth.shape[1], len(trial.prices.stock))
@@ -104,7 +104,7 @@ class Sample:
         table = np.einsum("itf,tk->itkf", features, knots).reshape(-1, shape[0] * shape[1])
         return np.moveaxis(_regression(table, worth).reshape(*shape, -1), 1, 2)
 
-    def _solved(self, trial: Trial) -> list[tuple[DrawProgram, Floats, Certificate]]:
+    def _optima(self, trial: Trial) -> list[tuple[DrawProgram, Floats, Certificate]]:
         solutions = []
         for program, proof in zip(self.programs, trial.proofs, strict=True):
             if proof.plan is None:
@@ -150,11 +150,11 @@ def fit_prices(
         trial = improve(sample, [trial], no_parts, scale)[-1]
         _check_reach(sample, trial, scale)
     progress(0.3)
-    informed, trials = trial.prices, [trial]
+    clairvoyant, trials = trial.prices, [trial]
     if functions:
         # while nothing is charged, the stocks from which it counts do not matter
         reference, response = sample.reference(trial)
-        trials = [replace(trial, prices=replace(informed, reference=reference, response=response))]
+        trials = [replace(trial, prices=replace(clairvoyant, reference=reference, response=response))]
         for _ in range(REGRESSIONS):
             trials.append(sample(replace(trials[0].prices, stock=sample.regression(trials[-1]))))
         progress(0.5)
@@ -162,7 +162,7 @@ def fit_prices(
         progress(0.8)
     means = [judges(trial.prices).values.mean() for trial in trials]
     progress(1.0)
-    return informed, trials[int(np.argmin(means))].prices
+    return clairvoyant, trials[int(np.argmin(means))].prices
 
 
 def _check_reach(sample: Sample, trial: Trial, scale: float) -> None:
@@ -198,23 +198,23 @@ def improve(
     first = int(np.argmin([trial.values.mean() for trial in trials]))
     best, best_at = trials[first], places[first]
     width = np.concatenate([np.ones(count), np.full(len(best_at) - count, scale if has_demand else 0.0)])
-    accepted, radius = [best], FIRST_RADIUS
+    improvements, radius = [best], FIRST_RADIUS
     for _ in range(CUTS):
         box = np.stack([best_at - radius * width, best_at + radius * width])
         box[0, count:] = np.maximum(box[0, count:], 0.0)
-        at, promised = cuts.lowest(box)
-        fall = best.values.mean() - promised
-        if fall <= SETTLED * scale:
+        at, estimate = cuts.lowest(box)
+        fall = best.values.mean() - estimate
+        if fall <= LEAST_FALL * scale:
             break
         prices = replace(best.prices, stock=np.einsum("p,pknf->knf", at[:count], parts), service=at[count:])
         trial = sample(prices)
         cuts.add(sample, trial, parts, at)
-        gained = best.values.mean() - trial.values.mean()
-        radius *= 2.0 if gained > 0.5 * fall else 1.0 if gained > WORTHWHILE * fall else 0.5
-        if gained > 0:
+        decrease = best.values.mean() - trial.values.mean()
+        radius *= 2.0 if decrease > 0.5 * fall else 1.0 if decrease > WORTHWHILE * fall else 0.5
+        if decrease > 0:
             best, best_at = trial, at
-            accepted.append(trial)
-    return accepted
+            improvements.append(trial)
+    return improvements
 
 
 class _Cuts:

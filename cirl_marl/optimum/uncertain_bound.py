@@ -45,7 +45,7 @@ class Sampling:
     draws: Annotated[
         int, "of which the bound is the mean, at least 10; as many episodes of ``compare`` draw the same"
     ] = 200
-    fitting: Annotated[int, "further draws, to which prices are fitted, at least 4"] = 32
+    fit_draws: Annotated[int, "further draws, to which prices are fitted, at least 4"] = 32
     seed: Annotated[int, "of the draws; different seeds share none"] = 0
     numbers: Annotated[bool, "whether the uncertain numbers of the network are drawn, too, once for each episode"] = (
         True
@@ -61,11 +61,11 @@ class Sampling:
         Raises:
             CirlError: for too few draws, or a place that cannot be used.
         """
-        for name, least in (("draws", FEWEST), ("fitting", 4)):
+        for name, least in (("draws", FEWEST), ("fit_draws", 4)):
             if getattr(self, name) < least:
                 raise CirlError(f"{name} {getattr(self, name)}: too few for an interval, at least {least}")
-        if max(self.draws, self.fitting) > SEED_SPACING // 2:
-            raise CirlError(f"draws and fitting must be at most {SEED_SPACING // 2:,}")
+        if max(self.draws, self.fit_draws) > SEED_SPACING // 2:
+            raise CirlError(f"draws and fit_draws must be at most {SEED_SPACING // 2:,}")
         check_place(self.on, self.workers, self.settings)
         if self.on == "slurm" and self.directory is None:
             raise CirlError("on 'slurm' needs a directory that all machines share")
@@ -89,7 +89,7 @@ class UncertainBound:
     informed_prices: Annotated[Prices, "on services alone, of who knows the future"]
     values: Annotated[Floats, "what is proved of each draw, penalty included, shape (draws,), mass"]
     informed_values: Annotated[Floats, "what is proved of who knows the future, likewise"]
-    counted: Annotated[Floats, "gross mass that λ counts in the plan of each draw, Δ·Σ|σ_k|·f̄_k, NaN without a plan"]
+    gross_mass: Annotated[Floats, "gross mass that λ counts in the plan of each draw, Δ·Σ|σ_k|·f̄_k, NaN without a plan"]
     certificates: Annotated[tuple[Certificate, ...], "multipliers of the program of each draw"]
 
     @property
@@ -114,18 +114,18 @@ class UncertainBound:
         return float(self.informed_values.mean())
 
     @property
-    def unsolved(self) -> int:
+    def failures(self) -> int:
         """Draws whose program the solver did not solve; they count with what other multipliers prove."""
-        return int(np.isnan(self.counted).sum())
+        return int(np.isnan(self.gross_mass).sum())
 
     @property
     def scale(self) -> float:
         """By what gaps are divided: |bound|, or the gross mass that λ counts where the bound is below 5 % of it."""
-        counted = float(np.nanmean(self.counted)) if self.unsolved < len(self.counted) else 0.0
-        return abs(self.value) if abs(self.value) >= NEAR_ZERO * counted else counted
+        gross_mass = float(np.nanmean(self.gross_mass)) if self.failures < len(self.gross_mass) else 0.0
+        return abs(self.value) if abs(self.value) >= NEAR_ZERO * gross_mass else gross_mass
 
     @property
-    def told(self) -> tuple[str, ...]:
+    def hidden_numbers(self) -> tuple[str, ...]:
         """Numbers drawn once per episode, which the bound knows from the start and a policy does not."""
         return tuple(self.network.uncertain) if self.sampling.numbers else ()
 
@@ -139,7 +139,7 @@ class UncertainBound:
         merit = np.asarray(circularity, dtype=float) + self.prices.service_value(np.asarray(levels, dtype=float))
         return np.asarray((self.values[: len(merit)] - merit) / self.scale)
 
-    def closed(self, merit: float) -> float:
+    def closure(self, merit: float) -> float:
         """Return the share of the distance between perfect information and a policy that the penalty closes.
 
         ``merit`` is the policy's mean of λ̄ + Σ_s μ_s (level_s − demand_s), with the prices of who knows the future.
@@ -150,8 +150,8 @@ class UncertainBound:
         """Draw everything again, compute what the multipliers prove of each draw, and return the mean, mass."""
         first, numbers, proofs = first_seed(self.sampling.seed), self.sampling.numbers, []
         draws = draw(self.network, self.agents, self.initial, numbers, first, len(self.values))
-        for one, certificate in zip(draws, self.certificates, strict=True):
-            problem = DrawProgram(one, self.agents or None, self.degree).priced(self.prices)
+        for future, certificate in zip(draws, self.certificates, strict=True):
+            problem = DrawProgram(future, self.agents or None, self.degree).with_prices(self.prices)
             proofs.append(verify(problem, certificate, np.zeros(len(problem.cost))).bound)
         return float(np.mean(proofs))
 
@@ -160,12 +160,16 @@ class UncertainBound:
         mass, demand = self.network.mass_unit, ""
         if self.min_service is not None and self.network.services:
             demand = f", expected service level at least {levels_text(self.network, self.min_service)}"
-        told = f"; it knows from the start what a policy does not: {', '.join(self.told)}" if self.told else ""
-        unsolved = f"; {self.unsolved} draws by multipliers of others" if self.unsolved else ""
+        hidden = (
+            f"; it knows from the start what a policy does not: {', '.join(self.hidden_numbers)}"
+            if self.hidden_numbers
+            else ""
+        )
+        failures = f"; {self.failures} draws by multipliers of others" if self.failures else ""
         return (
             f"bound of {self.network.name} for who does not foresee: mean λ̄ ≤ {self.value:.6g} {mass}{demand} (at most "
             f"{self.upper:.6g} with 95 % confidence, {len(self.values)} draws; with perfect information "
-            f"{self.perfect_information:.6g}){told}{unsolved}"
+            f"{self.perfect_information:.6g}){hidden}{failures}"
         )
 
 
@@ -199,16 +203,16 @@ def uncertain_bound(
         raise CirlError(f"network '{network.name}': nothing disturbs it and no number is drawn; leave out uncertain")
     first, actors = first_seed(sampling.seed), MultiAgentVectorEnv(network, num_envs=1, agents=agents).agents
     start = None if initial is None else starting_stocks(Lifetimes(network, actors), initial)
-    fitting = draw(network, agents, start, sampling.numbers, first + SEED_SPACING // 2, sampling.fitting)
+    futures = draw(network, agents, start, sampling.numbers, first + SEED_SPACING // 2, sampling.fit_draws)
     programs = []
-    for one in fitting:
-        programs.append(DrawProgram(one, agents, degree))
+    for future in futures:
+        programs.append(DrawProgram(future, agents, degree))
         check_size(programs[-1])
     demand = np.zeros(0) if min_service is None else min_service
     scale = network.objective.circularity_scale
-    informed, prices = fit_prices(programs, demand, scale, progress=lambda share: progress(0.3 * share))
+    clairvoyant, prices = fit_prices(programs, demand, scale, progress=lambda share: progress(0.3 * share))
     proofs = prove_draws(
-        network, actors, start, degree, sampling, (informed, prices), lambda share: progress(0.3 + 0.7 * share)
+        network, actors, start, degree, sampling, (clairvoyant, prices), lambda share: progress(0.3 + 0.7 * share)
     )
     return UncertainBound(
         network=network,
@@ -218,10 +222,10 @@ def uncertain_bound(
         sampling=sampling,
         min_service=min_service,
         prices=prices,
-        informed_prices=informed,
+        informed_prices=clairvoyant,
         values=proofs.values[:, 1],
         informed_values=proofs.values[:, 0],
-        counted=proofs.counted,
+        gross_mass=proofs.gross_mass,
         certificates=proofs.certificates,
     )
 
@@ -245,7 +249,7 @@ class Proofs:
     """What is proved of draws under some prices."""
 
     values: Annotated[Floats, "shape (draws, prices), mass"]
-    counted: Annotated[Floats, "gross mass that λ counts in the plan under the last prices, shape (draws,)"]
+    gross_mass: Annotated[Floats, "gross mass that λ counts in the plan under the last prices, shape (draws,)"]
     certificates: Annotated[tuple[Certificate, ...], "multipliers under the last prices"]
 
 
@@ -288,7 +292,7 @@ def prove_draws(
         parts = [job.proofs() for job in jobs]
     proofs = Proofs(
         np.concatenate([part.values for part in parts]),
-        np.concatenate([part.counted for part in parts]),
+        np.concatenate([part.gross_mass for part in parts]),
         tuple(certificate for part in parts for certificate in part.certificates),
     )
     if len(proofs.values) != sampling.draws or np.isnan(proofs.values).any():
@@ -323,20 +327,20 @@ class ProofJob:
     def run(self, tell: Tell) -> None:
         """Prove them, each from the basis of the one before."""
         draws = draw(self.network, self.agents, self.initial, self.numbers, self.first, self.count)
-        values, counted = np.empty((self.count, len(self.prices))), np.full(self.count, np.nan)
-        arrays: dict[str, Any] = {"values": values, "counted": counted}
+        values, gross_mass = np.empty((self.count, len(self.prices))), np.full(self.count, np.nan)
+        arrays: dict[str, Any] = {"values": values, "gross_mass": gross_mass}
         certificates: list[Certificate] = []
         basis = None
-        for i, one in enumerate(draws):
-            program = DrawProgram(one, self.agents or None, self.degree)
+        for i, future in enumerate(draws):
+            program = DrawProgram(future, self.agents or None, self.degree)
             for k, prices in enumerate(self.prices):
-                proof = program.prove(program.priced(prices), basis, certificates)
+                proof = program.prove(program.with_prices(prices), basis, certificates)
                 basis, values[i, k] = proof.basis or basis, proof.value
                 certificates = [proof.certificate, *certificates][: 2 * len(self.prices)]
             if proof.plan is not None:
                 weights = np.abs(circularity_weights(program.layout))
                 weights[program.layout.imbalance] = 0.0
-                counted[i] = proof.plan.reshape(self.network.episode.horizon, -1).mean(axis=0) @ weights
+                gross_mass[i] = proof.plan.reshape(self.network.episode.horizon, -1).mean(axis=0) @ weights
             arrays[f"equal{i}"], arrays[f"under{i}"] = proof.certificate.equal, proof.certificate.under
             tell("proving", i + 1, self.count)
 
@@ -352,4 +356,4 @@ class ProofJob:
             certificates = [
                 Certificate(equal=arrays[f"equal{i}"], under=arrays[f"under{i}"]) for i in range(self.count)
             ]
-            return Proofs(arrays["values"], arrays["counted"], tuple(certificates))
+            return Proofs(arrays["values"], arrays["gross_mass"], tuple(certificates))
