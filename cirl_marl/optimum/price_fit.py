@@ -44,7 +44,7 @@ LEAST_FALL = 1e-6
 
 
 @positional_record
-class Trial:
+class PriceTrial:
     """What prices prove of some draws."""
 
     prices: Prices
@@ -64,16 +64,16 @@ class Sample:
         self.programs = tuple(programs)
         self._bases: list[Basis | None] = [None] * len(programs)
 
-    def __call__(self, prices: Prices) -> Trial:
+    def __call__(self, prices: Prices) -> PriceTrial:
         """Solve all of them, each from where it was solved last, the first time from where the one before it was."""
         proofs, basis = [], None
         for i, program in enumerate(self.programs):
             proof = program.prove(program.with_prices(prices), self._bases[i] or basis)
             self._bases[i] = basis = proof.basis or self._bases[i]
             proofs.append(proof)
-        return Trial(prices, tuple(proofs))
+        return PriceTrial(prices, tuple(proofs))
 
-    def reference(self, trial: Trial) -> tuple[Floats, Floats]:
+    def reference(self, trial: PriceTrial) -> tuple[Floats, Floats]:
         """Return what is to be expected of stocks under the plans of a trial: ``reference`` and ``response``."""
         stocks = np.array([program.stocks(plan) for program, plan, _ in self._optima(trial)])
         past = np.array([past_of(program.draw.features) for program in self.programs])
@@ -81,11 +81,11 @@ class Sample:
         response = _regression((past - mean).reshape(-1, past.shape[2]), stocks - stocks.mean(axis=0))
         return stocks.mean(axis=0) - mean @ response, response
 
-    def levels(self, trial: Trial) -> Floats:
+    def levels(self, trial: PriceTrial) -> Floats:
         """Return the levels of each draw, shape (draws, services)."""
         return np.array([program.levels(plan) for program, plan, _ in self._optima(trial)])
 
-    def slopes(self, trial: Trial) -> tuple[Floats, Floats]:
+    def slopes(self, trial: PriceTrial) -> tuple[Floats, Floats]:
         """Return subgradients of ``values``: by θ, (draws, knots, stores, functions), and by μ, (draws, services)."""
         prices, by_stock = trial.prices, []
         for program, plan, _ in self._optima(trial):
@@ -94,7 +94,7 @@ class Sample:
             by_stock.append(-np.einsum("tk,tn,tf->knf", knots, apart, new))
         return np.array(by_stock), self.levels(trial) - prices.demand
 
-    def regression(self, trial: Trial) -> Floats:
+    def regression(self, trial: PriceTrial) -> Floats:
         """Return θ such that Σ_f θ_tf φ_f(s_t) is what stocks are worth, as near as it can be, by least squares."""
         worth = np.array([program.stock_values(certificate) for program, _, certificate in self._optima(trial)])
         features = np.array([program.draw.features[1:] for program in self.programs])
@@ -104,7 +104,7 @@ class Sample:
         table = np.einsum("itf,tk->itkf", features, knots).reshape(-1, shape[0] * shape[1])
         return np.moveaxis(_regression(table, worth).reshape(*shape, -1), 1, 2)
 
-    def _optima(self, trial: Trial) -> list[tuple[DrawProgram, Floats, Certificate]]:
+    def _optima(self, trial: PriceTrial) -> list[tuple[DrawProgram, Floats, Certificate]]:
         solutions = []
         for program, proof in zip(self.programs, trial.proofs, strict=True):
             if proof.plan is None:
@@ -165,7 +165,7 @@ def fit_prices(
     return clairvoyant, trials[int(np.argmin(means))].prices
 
 
-def _check_reach(sample: Sample, trial: Trial, scale: float) -> None:
+def _check_reach(sample: Sample, trial: PriceTrial, scale: float) -> None:
     """Refuse levels that are missed at any price."""
     prices, levels = trial.prices, sample.levels(trial).mean(axis=0)
     for s in np.flatnonzero((levels < prices.demand - SHORT) & (prices.service > OUT_OF_REACH * scale)).tolist():
@@ -177,8 +177,8 @@ def _check_reach(sample: Sample, trial: Trial, scale: float) -> None:
 
 
 def improve(
-    sample: Sample, trials: Sequence[Trial], parts: Floats, scale: float, has_demand: bool = True
-) -> list[Trial]:
+    sample: Sample, trials: Sequence[PriceTrial], parts: Floats, scale: float, has_demand: bool = True
+) -> list[PriceTrial]:
     """Lower the mean of what is proved by cutting planes in a box around the best prices so far.
 
     Args:
@@ -225,7 +225,7 @@ class _Cuts:
         self._slopes: list[Floats] = []
         self._offsets: list[Floats] = []
 
-    def add(self, sample: Sample, trial: Trial, parts: Floats, at: Floats) -> None:
+    def add(self, sample: Sample, trial: PriceTrial, parts: Floats, at: Floats) -> None:
         """Add the planes that touch it at a trial."""
         by_stock, by_service = sample.slopes(trial)
         slopes = np.concatenate([np.einsum("iknf,pknf->ip", by_stock, parts), by_service], axis=1)
