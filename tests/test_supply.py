@@ -191,6 +191,96 @@ def test_several_services_are_solved_together() -> None:
     np.testing.assert_allclose(cars[exact], np.array(network.interval_means(network.services[0].low))[exact], rtol=1e-9)
 
 
+def workshops(seed: int, count: int) -> Network:
+    """Return products with a maker each; makers pass to each other, get scrap back, and are fed by two sources."""
+    rng = np.random.default_rng(seed)
+    nodes = [Node(id="ore", role=Role.NONRENEWABLE_RESERVOIR), Node(id="dump", role=Role.LANDFILL, initial=(0.0, 0.0))]
+    arcs: list[Arc] = []
+    services = []
+    for i in range(count):
+        nodes.append(Node(id=f"maker_{i}", stores=False))
+        mean = float(rng.uniform(2.0, 20.0))
+        lifetime = Lifetime(mean=mean, deviation=0.4 * mean, distribution="weibull")
+        nodes.append(Node(id=f"product_{i}", lifetime=lifetime, initial=(80.0, 120.0)))
+        services.append(
+            Service(id=f"need_{i}", provider=f"product_{i}", quantity="stock", low=float(rng.uniform(70, 130)))
+        )
+        for n, weight in enumerate((0.9, 0.1)):
+            high = float(rng.choice([1.0, 10.0, 200.0]))
+            control = Control(kind=ControlKind.FLOW, low=float(rng.uniform(0, 1)), neutral=1.0, high=high)
+            arcs.append(
+                Arc(id=f"mine_{i}_{n}", donor="ore", recipient=f"maker_{i}", law=Law.CONTROLLED, control=control,
+                    makes_up_for=f"need_{i}", weight=weight)
+            )  # fmt: skip
+        trade = Control(kind=ControlKind.SHARE, low=0.0, neutral=0.1, high=0.3)
+        scrap: dict[str, Any] = {"donor": f"product_{i}", "law": Law.SHARE}
+        if count > 1:
+            arcs.append(
+                Arc(
+                    id=f"trade_{i}",
+                    donor=f"maker_{i}",
+                    recipient=f"maker_{(i + 1) % count}",
+                    law=Law.SHARE,
+                    control=trade,
+                )
+            )
+        arcs.append(Arc(id=f"make_{i}", donor=f"maker_{i}", recipient=f"product_{i}", law=Law.SHARE))
+        arcs.append(Arc(id=f"scrap_{i}", recipient=f"maker_{rng.integers(count)}", share=0.6, **scrap))
+        arcs.append(Arc(id=f"loss_{i}", recipient="dump", **scrap))
+    return Network(
+        name="workshops", nodes=tuple(nodes), arcs=tuple(arcs), services=tuple(services),
+        episode=Episode(horizon=4), time_unit="year",
+    )  # fmt: skip
+
+
+@given(seed=st.integers(0, 2**31), count=st.integers(1, 7))
+@settings(max_examples=8)
+def test_nothing_lacks_that_can_be_had_and_nothing_is_supplied_in_vain(seed: int, count: int) -> None:
+    """What complementarity says, for random networks, whatever the agents do; and a copy is what it is alone."""
+    network = workshops(seed, count)
+    traders = [arc.id for arc in network.arcs if arc.id.startswith("trade")] or ["mine_0_1"]
+    env, lone = (MultiAgentVectorEnv(network, num_envs=n, agents=traders) for n in (3, 1))
+    env.reset(seed=[1, 2, 3])
+    lone.reset(seed=[3])
+    demand = np.array([network.interval_means(service.low) for service in network.services])
+    supplies = [[env.network.control_rows[f"mine_{i}_{n}"].start for n in (0, 1)] for i in range(count)]
+    for year in range(4):
+        actions = np.random.default_rng(seed + year).uniform(-1, 1, (len(traders), 3))
+        flow = env.advance(actions).flow
+        np.testing.assert_array_equal(flow[:, 2:], lone.advance(actions[:, 2:]).flow)
+        stock = env.rows.stocks(env.physical.stock)
+        for i, (rows, service) in enumerate(zip(supplies, network.services, strict=True)):
+            if traders == ["mine_0_1"]:
+                continue
+            low, high = (table[rows][:, :1] for table in (env.dynamics.control_low, env.dynamics.control_high))
+            asked, level = env.controls[rows], stock[network.node_index[service.provider]] / demand[i, year]
+            extent = (asked - low) / np.array([[0.9], [0.1]])
+            is_full = asked >= high * (1 - 1e-12)
+            assert (is_full.all(axis=0) | (level > 1 - 1e-9)).all()
+            assert ((asked <= low * (1 + 1e-12)).all(axis=0) | (level < 1 + 1e-9)).all()
+            proportional = ~is_full.any(axis=0)
+            np.testing.assert_allclose(extent[0, proportional], extent[1, proportional], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.medium
+def test_supplies_cost_few_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two rough guesses and the interval itself are enough for the usual year of steel in Japan."""
+    env = MultiAgentVectorEnv("steel_japan", num_envs=2)
+    advance, series = env.dynamics.advance, list[int]()
+
+    def counted(*args: Any, **options: Any) -> Any:
+        series.append(options.get("terms") or env.dynamics.terms)
+        return advance(*args, **options)
+
+    env.reset(seed=0)
+    monkeypatch.setattr(env.dynamics, "advance", counted)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        env.advance(rng.uniform(-1, 1, (len(env.agents), 2)))
+    assert sum(series) <= 2 * 20 * env.dynamics.terms
+    assert series.count(env.dynamics.terms) >= 20
+
+
 def reserve(stock: float, most: float, demand: float = 47.0, export: float = 0.0) -> Network:
     """Return a product made from a reserve that may not last."""
     control = Control(kind=ControlKind.FLOW, low=0.0, neutral=0.0, high=most)

@@ -96,9 +96,11 @@ class Dynamics(FlowLaws):
         controls: Floats,
         step: Integers | None = None,
         factors: Floats | None = None,
+        terms: int | None = None,
     ) -> Transition:
         """Hold ``controls`` for one control interval; arguments are as in ``Transition`` and ``FlowLaws.rate``.
 
+        A rough guess takes only so many ``terms`` of the exact solver's series; it conserves mass all the same.
         In the physical mode scheduled flows are first cut to what their donor can deliver, so the realised flows may be
         lower than those asked for. Networks without time series and batches need no ``step``.
 
@@ -126,7 +128,7 @@ class Dynamics(FlowLaws):
             actual_rate = self._limit_orders(stock, rate) if self.physical else rate
             if self._taylor is not None:
                 stock, transfer, actual_rate = self._settle(
-                    stock, actual_rate, partial(self._taylor.moved_mass, stock, routes)
+                    stock, actual_rate, partial(self._taylor.moved_mass, stock, routes, terms)
                 )
             else:
                 stock, inner, transfer, actual_rate = self._explicit_step(stock, inner, actual_rate, routes, controls)

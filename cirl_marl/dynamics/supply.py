@@ -1,27 +1,29 @@
 """What arcs supply that make up for a service while nobody acts on them: business as usual.
 
-The arcs of service s supply u_k = min(low_k + weight_k V_s, high_k). Without cuts the interval's map from V to what the
-services measure is affine, q = β + A V with A ≥ 0: one interval with V gives q, one more for each service a column of
-A, and then V solves ::
+The arcs of service s supply u_k = min(low_k + weight_k v_s, high_k), with v_s such that together they supply U_s more
+than low. Without cuts the interval's map from U to what the services measure is affine, q = β + A U with A ≥ 0, and
+U solves ::
 
-    V_s = 0 where q_s ≥ D_s,    V_s at its most where q_s ≤ D_s,    q_s = D_s elsewhere,
+    U_s = 0 where q_s ≥ D_s,    U_s at its most where q_s ≤ D_s,    q_s = D_s elsewhere,
 
-with D the lower ends of the services' bands: a linear complementarity problem. Where an arc is at its bound, or a donor
-delivers less, the map bends; it is then solved again from there. What others do in the interval is known. Nothing is
-said about a service whose supply cannot be enough: its level falls short.
-
-Where more than ``MOST_PROBES`` services are made up for, A is not measured but what arrives at once (``Arrivals``),
-with a factor for each service: how much of what was expected of the last correction has come about.
+with D the lower ends of the services' bands: a linear complementarity problem. A is what arrives at once past nodes
+without stock (``Arrivals``), with a factor for each service: how much of what was expected of the last correction has
+come about. Where arcs have come to their bounds their column is found anew. The last of the intervals that are
+simulated on the way is the interval itself. What others do in it is known. Nothing is said about a service whose supply
+cannot be enough: its level falls short.
 """
 
 from __future__ import annotations
 
 from collections.abc import Container, Sequence
+from dataclasses import fields
+from typing import Any
 
 import numpy as np
 
-from cirl_marl.dynamics.integrator import Dynamics
+from cirl_marl.dynamics.integrator import Dynamics, Transition
 from cirl_marl.dynamics.laws import FlowLaws
+from cirl_marl.dynamics.routing import IntervalRoutes
 from cirl_marl.dynamics.uncertain_factors import ControlFactors, RowFactors
 from cirl_marl.network import Floats, Integers, RowSum
 from cirl_marl.network.compartment_model import Bools
@@ -30,15 +32,13 @@ from cirl_marl.network.uncertainty import numbers_of
 
 TINY = 1e-9
 """Part of a supply that arrives in an interval, below which it is taken for none."""
-CLOSE = 1e-12
+CLOSE = 3e-10
 """Distance of what is measured from what is demanded, relative to that, at which nothing lacks."""
-PROBE, LEAST = 1e-3, 1e-6
-"""Parts of what lacks, and of what is demanded, by the larger of which the columns of A are found."""
 ROUNDS, SWEEPS, CHANGES = 12, 500, 30
-"""Most times that the map is followed where it bends; and each time Gauss-Seidel sweeps, and changes of which supplies
-are at their bounds."""
-MOST_PROBES = 4
-"""Most services for each of which an interval is tried to find a column of A."""
+"""Most corrections; and for each Gauss-Seidel sweeps, and changes of which supplies are at their bounds."""
+TERMS, SURE, GUESSES = 6, 6e-6, 4
+"""Terms of the solver's series by which intervals are guessed until no more than this part of the demand lacks: what is
+left then after one more correction is little; and most corrections by guesses."""
 CELLS = 80_000
 """Most masses of all copies together that are worked on at once; more do not stay in a cache."""
 NOTICEABLE = 1e-7
@@ -63,7 +63,8 @@ class Supply:
         self._of: Integers = np.array([order.index(arc.makes_up_for) for arc in made_up], dtype=np.intp)
         self._rows: Integers = np.array([network.control_rows[arc.id].start for arc in made_up], dtype=np.intp)
         weights = [1.0 if arc.weight is None else arc.weight for arc in made_up]
-        self._weights = np.array(weights).reshape(-1, 1)
+        self._weights, self._most_arcs = np.array(weights).reshape(-1, 1), int(np.bincount(self._of).max(initial=0))
+        self._total = RowSum(self._of, np.arange(len(made_up)), 1.0, (len(services), len(made_up)))
         demand = [network.interval_means(service.low) for service in services]
         self._demand = np.array(demand).reshape(len(services), network.episode.horizon)
         numbers = numbers_of(dynamics.factors.ranges, "services", "low")
@@ -83,9 +84,7 @@ class Supply:
         indices = np.array([network.arc_index[arc] for arc in self.arcs], dtype=np.intp)
         self._arrivals = Arrivals(dynamics, services, indices, self._of)
         interval = network.episode.control_interval
-        self._duration = np.array([interval if service_.quantity == "stock" else 1.0 for service_ in services])[
-            :, None, None
-        ]
+        self._duration = np.array([interval if service_.quantity == "stock" else 1.0 for service_ in services])[:, None]
 
     def idle(self, agents: Container[str]) -> Bools:
         """Return which of ``arcs`` nobody acts on, shape (arcs, 1)."""
@@ -100,111 +99,131 @@ class Supply:
         idle: Bools,
         factors: Floats | None = None,
     ) -> Floats:
-        """Return the controls of an interval with what ``idle`` arcs supply, shape (controls, B).
+        """Return the controls of an interval with what ``idle`` arcs supply; arguments are as in ``advance``."""
+        return self.advance(stock, inner, controls, step, idle, factors)[0] if idle.any() else controls
+
+    def advance(
+        self,
+        stock: Floats,
+        inner: Floats,
+        controls: Floats,
+        step: Integers,
+        idle: Bools,
+        factors: Floats | None = None,
+    ) -> tuple[Floats, Transition]:
+        """Hold controls for an interval in which ``idle`` arcs make up for services.
 
         Args:
             stock: masses at its start, as ``Dynamics.advance`` takes them.
             inner: inner states.
-            controls: of all others.
+            controls: of all others, shape (controls, B).
             step: index of the interval in each copy, shape (B,).
             idle: which arcs nobody acts on in each copy, shape (arcs, B or 1).
             factors: on the uncertain numbers, as ``Dynamics.advance`` takes them.
+
+        Returns:
+            the controls with what the arcs supply, and what the interval did.
         """
         if not idle.any():
-            return controls
+            return controls, self._dynamics.advance(stock, inner, controls, step, factors)
         batch, idle = controls.shape[1], np.broadcast_to(idle, (len(self.arcs), controls.shape[1]))
         block = max(1, CELLS // self._dynamics.rows.masses)
-        if batch <= block:
-            return self._controls_of_block(stock, inner, controls, step, idle, factors)
         parts = []
         for columns in (slice(first, first + block) for first in range(0, batch, block)):
             masses, states, others = (np.ascontiguousarray(array[:, columns]) for array in (stock, inner, controls))
             draws = None if factors is None else np.ascontiguousarray(factors[:, columns])
-            parts.append(self._controls_of_block(masses, states, others, step[columns], idle[:, columns], draws))
-        return np.concatenate(parts, axis=1)
+            parts.append(self._advance_block(masses, states, others, step[columns], idle[:, columns], draws))
+        if len(parts) == 1:
+            return parts[0]
+        arrays = zip(*([getattr(done, field.name) for field in fields(done)] for _, done in parts), strict=True)
+        joint: list[Any] = [None if array[0] is None else np.concatenate(array, axis=-1) for array in arrays]
+        return np.concatenate([part for part, _ in parts], axis=1), Transition(*joint)
 
-    def _controls_of_block(
+    def _advance_block(
         self, stock: Floats, inner: Floats, controls: Floats, step: Integers, idle: Bools, factors: Floats | None
-    ) -> Floats:
-        """Return what ``__call__`` does, for copies so few that all they take stays in a cache."""
-        batch, count = controls.shape[1], len(self._demand)
-        low = self._drawn(self._dynamics.control_low[self._rows].take(step, axis=1), factors)
-        high = self._dynamics.capacity_in(step, factors)[self._rows]
+    ) -> tuple[Floats, Transition]:
+        """Do what ``advance`` does, for copies so few that all they take stays in a cache."""
+        dynamics, batch, count = self._dynamics, controls.shape[1], len(self._demand)
+        low = self._drawn(dynamics.control_low[self._rows].take(step, axis=1), factors)
+        high = dynamics.capacity_in(step, factors)[self._rows]
         demand = self._factors(self._demand.take(step, axis=1), factors)
-        most = np.zeros((count, batch))
-        weights = np.broadcast_to(self._weights, low.shape)
-        range_ = np.divide(high - low, weights, out=np.zeros_like(low), where=idle & (weights > 0))
-        np.maximum.at(most, self._of, range_)
+        weights = np.where(idle, self._weights, 0.0)
+        reach = np.divide(np.maximum(high - low, 0.0), weights, out=np.zeros_like(low), where=weights > 0)
+        most, furthest = self._total(weights * reach), np.zeros((count, batch))
+        np.maximum.at(furthest, self._of, reach)
 
-        def controls_for(supply: Floats) -> Floats:
-            """Return all controls for V, shape (services, B), shape (controls, B)."""
-            all_controls = controls.copy()
-            target = np.minimum(low + self._weights * supply[self._of], high)
-            all_controls[self._rows] = np.where(idle, target, controls[self._rows])
-            return all_controls
+        def extents(supply: Floats) -> Floats:
+            """Return v, at which arcs supply U, shape (services, B)."""
+            extent = np.zeros_like(supply)
+            for _ in range(self._most_arcs):  # U is concave in v: each tangent leads past a bend, or to the end
+                lack = supply - self._total(weights * np.minimum(extent[self._of], reach))
+                per_extent = self._total(np.where(extent[self._of] < reach, weights, 0.0))
+                extent += np.divide(lack, per_extent, out=np.zeros_like(lack), where=per_extent > 0)
+            return np.where(supply < most, extent, furthest)
 
-        def probed_slope(supply: Floats, base: Floats) -> Floats:
-            """Return A, shape (services, services, B), from an interval for each column."""
-            # small beside what lacks, as a donor may hold little more than that, and not lost in rounding
-            probe = np.minimum(np.maximum(PROBE * np.abs(demand - base), LEAST * demand) / interval, PROBE * most)
-            trials = [controls_for(supply + probe * (np.arange(count) == s)[:, None]) for s in range(count)]
-            responses = self._service_quantities(stock, inner, np.concatenate(trials, axis=1), step, count, factors)
-            more = responses.reshape(count, count, batch) - base[:, None]
-            return np.divide(more, probe, out=np.zeros_like(more), where=probe > 0)
+        supply, base = np.zeros((2, count, batch))
+        slope, factor = np.zeros((batch, count, count)), np.ones((count, batch))
+        all_controls, room = controls.copy(), None
+        rate = dynamics.rate(controls, step, factors)
+        routes, interval = dynamics.routing.routes(rate), dynamics.network.episode.control_interval
+        done: Transition | None = None
+        for terms, accuracy, rounds in ((TERMS, SURE, GUESSES), (None, CLOSE, ROUNDS)):
+            open_, expected = np.ones(batch, dtype=bool), np.zeros((count, batch))
+            for correction in range(rounds + 1):
+                extent = extents(supply)[self._of]
+                target = np.minimum(low + weights * extent, high)
+                all_controls[self._rows] = np.where(idle, target, controls[self._rows])
+                copies = np.flatnonzero(open_)
+                part = dynamics.advance(
+                    stock.take(copies, axis=1),
+                    inner.take(copies, axis=1),
+                    all_controls.take(copies, axis=1),
+                    step[copies],
+                    None if factors is None else factors.take(copies, axis=1),
+                    terms=terms,
+                )
+                done = part if done is None or len(copies) == batch else _with_copies(done, copies, part)
+                earlier, base[:, copies] = base.copy(), self._quantities(part)
+                shortage = demand - base
+                gap = np.where(np.where(shortage > 0, supply < most, supply > 0), np.abs(shortage), 0.0)
+                is_wrong = open_ & (gap > CLOSE * demand).any(axis=0)
+                if correction == rounds or not is_wrong.any():
+                    break
+                is_telling = is_wrong & (np.abs(expected) > NOTICEABLE * demand)
+                factor *= np.divide(base - earlier, expected, out=np.ones_like(base), where=is_telling)
+                has_room = (weights > 0) & (extent < reach)
+                bends = np.ones((count, batch), dtype=bool)
+                if room is not None:
+                    bends = self._total((has_room != room).astype(float)) > 0
+                per_extent = self._total(np.where(has_room, weights, 0.0))[self._of]
+                unit = np.divide(weights, per_extent, out=np.zeros_like(weights), where=has_room)
+                self._arrivals.update(slope, rate, routes, unit, bends)
+                room = has_room
+                # copy by copy in memory, so that sums have the same order whatever the batch
+                per_supply = slope * np.ascontiguousarray((self._duration * factor).T)[..., None]
+                before, wrong = supply.copy(), np.flatnonzero(is_wrong)
+                short, now, high_ = (array.take(wrong, axis=1) for array in (shortage, supply, most))
+                supply[:, wrong] = _complementary(per_supply[wrong], short, now, high_, interval)
+                change = supply - before
+                expected = (per_supply * np.ascontiguousarray(change.T)[:, None]).sum(axis=2).T
+                open_ = is_wrong & (gap > accuracy * demand).any(axis=0) & (change != 0.0).any(axis=0)
+                if not open_.any():
+                    break
+        assert done is not None
+        return all_controls, done
 
-        def room(supply: Floats) -> Bools:
-            """Return which arcs can supply more, shape (arcs, B)."""
-            has_room: Bools = idle & (low + self._weights * supply[self._of] < high)
-            return has_room
-
-        def arrival_slope(supply: Floats) -> Floats:
-            """Return A, but for a factor in each row."""
-            rate = self._dynamics.rate(controls_for(supply), step, factors)
-            slope_: Floats = self._arrivals(rate, np.where(room(supply), self._weights, 0.0)) * self._duration
-            return slope_
-
-        supply, interval = np.zeros((count, batch)), self._dynamics.network.episode.control_interval
-        open_, factor = np.ones(batch, dtype=bool), np.ones((count, batch))
-        before: tuple[Floats, Floats, Floats] | None = None
-        for _ in range(ROUNDS):
-            base = self._service_quantities(stock, inner, controls_for(supply), step, 1, factors)
-            shortage = demand - base
-            lacks = (shortage > CLOSE * demand) & (supply < most) | (shortage < -CLOSE * demand) & (supply > 0)
-            open_ &= lacks.any(axis=0)
-            if not open_.any():
-                break
-            if count <= MOST_PROBES:
-                slope = _by_copy(probed_slope(supply, base))
-            else:
-                has_bent = np.ones((1, batch), dtype=bool)
-                if before is not None:
-                    has_bent = (room(supply) != room(before[0])).any(axis=0, keepdims=True)
-                    # where an arc has come to its bound, less was to be expected
-                    is_telling = (np.abs(before[2]) > NOTICEABLE * demand) & ~has_bent
-                    factor *= np.divide(base - before[1], before[2], out=np.ones_like(base), where=is_telling)
-                if has_bent.any():
-                    arrivals = _by_copy(arrival_slope(supply))
-                slope = arrivals * factor.T[..., None]
-            better = np.where(open_, _complementary(slope, shortage, supply, most, interval), supply)
-            before = supply, base, (slope * np.ascontiguousarray((better - supply).T)[:, None]).sum(axis=2).T
-            supply = better
-        return controls_for(supply)
-
-    def _service_quantities(
-        self, stock: Floats, inner: Floats, controls: Floats, step: Integers, times: int, factors: Floats | None
-    ) -> Floats:
-        """Return what the services measure at the end of the interval under several controls, shape (services, …)."""
-        dynamics = self._dynamics
-        start = np.tile(stock, (1, times)), np.tile(inner, (1, times))
-        draws = None if factors is None else np.tile(factors, (1, times))
-        done = dynamics.advance(*start, controls, np.tile(step, times), draws)
-        flow = done.moved_mass / dynamics.network.episode.control_interval
-        return self._measure(np.concatenate([dynamics.rows.stocks(done.stock), flow]))
+    def _quantities(self, done: Transition) -> Floats:
+        """Return what the services measure at the end of an interval, shape (services, B)."""
+        flow = done.moved_mass / self._dynamics.network.episode.control_interval
+        return self._measure(np.concatenate([self._dynamics.rows.stocks(done.stock), flow]))
 
 
-def _by_copy(slope: Floats) -> Floats:
-    """Return A copy by copy, shape (B, services, services), so that sums have the same order whatever the batch."""
-    return np.ascontiguousarray(np.moveaxis(slope, 2, 0))
+def _with_copies(done: Transition, copies: Integers, part: Transition) -> Transition:
+    """Return what an interval did, with some copies, in place, as they are in ``part``."""
+    for field in fields(done):
+        if (array := getattr(done, field.name)) is not None:
+            array[..., copies] = getattr(part, field.name)
+    return done
 
 
 def _complementary(slope: Floats, shortage: Floats, supply: Floats, most: Floats, interval: float) -> Floats:
@@ -241,17 +260,19 @@ def _active_set(slope: Floats, shortage: Floats, supply: Floats, most: Floats, a
     free, pinned_values = arrives & (most > 0), np.where(arrives, 0.0, supply)
     solution, is_solved, unit = supply.copy(), np.zeros(len(supply), dtype=bool), np.eye(supply.shape[1])
     for _ in range(CHANGES):
-        trial = _solve(np.where(free[..., None], slope, unit), np.where(free, target, pinned_values))
-        excess = target - (slope * trial[:, None]).sum(axis=2)  # what lacks still
-        under, over = free & (trial < 0), free & (trial > most)
-        back = ~free & arrives & (most > 0) & np.where(pinned_values > 0, excess < 0, excess > 0)
+        left = np.flatnonzero(~is_solved)
+        a, b, pinned, high = (array[left] for array in (slope, target, pinned_values, most))
+        is_free: Bools = free[left]
+        trial = _solve(np.where(is_free[..., None], a, unit), np.where(is_free, b, pinned))
+        excess = b - (a * trial[:, None]).sum(axis=2)  # what lacks still
+        under, over = is_free & (trial < 0), is_free & (trial > high)
+        back = ~is_free & arrives[left] & (high > 0) & np.where(pinned > 0, excess < 0, excess > 0)
         is_settled = ~(under | over | back).any(axis=1) & np.isfinite(trial).all(axis=1)
-        solution[is_settled & ~is_solved] = trial[is_settled & ~is_solved]
-        is_solved |= is_settled
+        solution[left[is_settled]], is_solved[left] = trial[is_settled], is_settled
         if is_solved.all():
             break
-        pinned_values = np.where(under, 0.0, np.where(over, most, pinned_values))
-        free = np.asarray((free & ~under & ~over) | back)
+        pinned_values[left] = np.where(under, 0.0, np.where(over, high, pinned))
+        free[left] = (is_free & ~under & ~over) | back
     return solution, is_solved
 
 
@@ -317,23 +338,33 @@ class Arrivals:
             columns += columns_
         self._measure = RowSum(rows, columns, 1.0, (len(services), len(place)))
 
-    def __call__(self, rate: Floats, weights: Floats) -> Floats:
-        """Return what each service measures more per supply to each, shape (services, services, B), per time.
+    def update(
+        self, slope: Floats, rate: Floats, routes: IntervalRoutes | None, supply: Floats, changes: Bools
+    ) -> None:
+        """Write what each service measures more per supply to each, per time, into those columns that change.
 
         Args:
+            slope: shape (B, services, services).
             rate: of all arcs in the interval, with their shares, shape (arcs, B).
-            weights: of each of ``arcs`` in the supply that it belongs to, shape (arcs, B).
+            routes: by these shares.
+            supply: what each of the arcs carries of a unit for its service, shape (arcs, B).
+            changes: services whose column is to be written, shape (services, B).
         """
+        if changes.all():
+            for s in range(self._count):
+                slope[:, :, s] = self._response(rate, routes, np.where(self._of[:, None] == s, supply, 0.0)).T
+            return
+        services, copies = np.nonzero(changes)
+        rate, supply = rate.take(copies, 1), np.where(self._of[:, None] == services, supply.take(copies, 1), 0.0)
+        slope[copies, :, services] = self._response(rate, self._laws.routing.routes(rate), supply).T
+
+    def _response(self, rate: Floats, routes: IntervalRoutes | None, supply: Floats) -> Floats:
+        """Return what services measure more for what each of the arcs supplies, shapes (services, B), (arcs, B)."""
         routing = self._laws.routing
-        routes = routing.routes(rate)
-        response = np.zeros((self._count, self._count, rate.shape[1]))
-        shares = rate.take(routing.arcs, 0)
-        for s in range(self._count):
-            supply = np.where(self._of[:, None] == s, weights, 0.0)
-            through = np.zeros((routing.nodes, rate.shape[1]))
-            np.add.at(through, self._into, supply[self._stockless_ends])
-            onward_flow = np.empty((0, rate.shape[1]))
-            if routes is not None:
-                onward_flow = routing.throughputs(through, routes).take(routing.throughput_rows, 0) * shares
-            response[:, s] = self._measure(np.concatenate([onward_flow, supply]))
-        return response
+        through = np.zeros((routing.nodes, rate.shape[1]))
+        np.add.at(through, self._into, supply[self._stockless_ends])
+        onward_flow = np.empty((0, rate.shape[1]))
+        if routes is not None:
+            through = routing.throughputs(through, routes).take(routing.throughput_rows, 0)
+            onward_flow = through * rate.take(routing.arcs, 0)
+        return self._measure(np.concatenate([onward_flow, supply]))

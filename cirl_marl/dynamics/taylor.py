@@ -63,16 +63,22 @@ class Taylor:
         return k
 
     def moved_mass(
-        self, stock: Floats, routes: IntervalRoutes | None, rate: Floats, imposed_flow: Floats | None = None
+        self,
+        stock: Floats,
+        routes: IntervalRoutes | None,
+        terms: int | None,
+        rate: Floats,
+        imposed_flow: Floats | None = None,
     ) -> Floats:
         """Return h·r∘ȳ[driver], ȳ the exact mean of the state over the substep, shape (arcs, B).
 
+        It is rough if not all ``terms`` of the series are to be summed.
         Flows given in ``imposed_flow``, shape (arcs, B), hold whatever the state; NaN where the flow law does.
         """
         if self._shortcut is not None and routes is not None and imposed_flow is None:
-            transfer = self.flow(self._shortcut.mean(stock, routes, rate), routes, rate)
+            transfer = self.flow(self._shortcut.mean(stock, routes, terms, rate), routes, rate)
         else:
-            transfer = self._mean_flow(stock, routes, rate, imposed_flow)
+            transfer = self._mean_flow(stock, routes, terms, rate, imposed_flow)
         transfer *= self._substep
         if self._pulls:
             np.maximum(transfer, 0.0, out=transfer)  # the mean of an overdrawn stock may be negative
@@ -91,11 +97,16 @@ class Taylor:
         return flow
 
     def _mean_flow(
-        self, stock: Floats, routes: IntervalRoutes | None, rate: Floats, imposed_flow: Floats | None
+        self,
+        stock: Floats,
+        routes: IntervalRoutes | None,
+        terms: int | None,
+        rate: Floats,
+        imposed_flow: Floats | None,
     ) -> Floats:
         """Return r∘ȳ[driver], with the flows of all arcs in each term."""
         laws, flow, mean = self._laws, np.empty_like(rate), stock.copy()
-        for incidence in (*self._horner, None):
+        for incidence in (*self._horner[-(terms or self.terms) :], None):
             mean.take(laws.driver, axis=0, out=flow, mode="clip")
             flow *= rate
             if imposed_flow is not None:
@@ -156,7 +167,7 @@ class KronReduction:
         self._inflow_matrix = square_matrix(inflow_rows, rows[0] | rows[1] | rows[2] | rows[3] | rows[6], size)
         self._spread = square_matrix(spread, rows[3] | rows[4] | rows[5] | rows[6], size)
 
-    def mean(self, stock: Floats, routes: IntervalRoutes, rate: Floats) -> Floats:
+    def mean(self, stock: Floats, routes: IntervalRoutes, terms: int | None, rate: Floats) -> Floats:
         """Return the mean of the masses over the substep for constant ``rate``, shape (masses, B)."""
         rates, shares = rate.take(self._varying_flows, 0), routes.rate.take(self._varying_arcs, 0)
         work: Floats = np.empty((self._change.stop, stock.shape[1]))
@@ -164,7 +175,7 @@ class KronReduction:
         flows, kept_rows = work[self._flows], work[self._kept_rows]
         varying_rows, change, rest = work[self._varying_rows], work[self._change], work[self._rest]
         mean[...] = stock
-        for factor in self._factors:
+        for factor in self._factors[-(terms or len(self._factors)) :]:
             np.multiply(mean.take(self._drivers, 0), rates, out=flows)
             rest.fill(0.0)
             self._inflow_matrix.substitute(work)

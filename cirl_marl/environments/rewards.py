@@ -253,8 +253,7 @@ class Credit:
             idle[[arc == agent for arc in self._supply.arcs], columns] = True
         stock, inner, step = np.tile(state.stock, count), np.tile(state.inner, count), np.tile(state.step, count)
         factors = None if factors is None else np.tile(factors, count)
-        counterfactual = self._supply(stock, inner, counterfactual, step, idle, factors)
-        transition = dynamics.advance(stock, inner, counterfactual, step, factors)
+        _, transition = self._supply.advance(stock, inner, counterfactual, step, idle, factors)
         flow = transition.moved_mass / dynamics.network.episode.control_interval
         end, mean, _ = self.circularity(replace(state, batched=np.tile(state.batched, count)), transition, flow)
         return (end if self._measure == "end" else mean).reshape(count, batch)

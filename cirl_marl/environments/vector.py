@@ -346,8 +346,8 @@ class MultiAgentVectorEnv:
             raise ControlError(f"the episode is over after {horizon} steps: call reset()")
         factors = self.factors_in(state.step)
         controls = self._actuators.controls(actions, state.step, factors)
-        controls = self.controls = self.supply(state.stock, state.inner, controls, state.step, self._idle, factors)
-        transition = dynamics.advance(state.stock, state.inner, controls, state.step, factors)
+        controls, transition = self.supply.advance(state.stock, state.inner, controls, state.step, self._idle, factors)
+        self.controls = controls
         quantities, flow = self._measure(transition, controls)
         levels = self.scoring.levels(quantities, state.step, factors)
         service = self.scoring.service_level(levels)

@@ -115,10 +115,9 @@ def _jacobians(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats, Floats
     interval = np.repeat(np.arange(steps), nodes + entries + 1)
     inner = np.empty((0, flat.shape[1]))
     stocks, supply = dynamics.extend(flat[:nodes]), Supply(dynamics)
-    controls = supply(
+    _, done = supply.advance(
         stocks, inner, actuators.controls(flat[nodes:], interval), interval, supply.idle(actuators.agents)
     )
-    done = dynamics.advance(stocks, inner, controls, interval)
     outputs = np.concatenate([done.stock[rows.nodes], done.moved_mass / network.episode.control_interval])
     by_interval = outputs.reshape(len(outputs), steps, -1).transpose(1, 0, 2)
     slopes = (by_interval[:, :, :-1] - by_interval[:, :, -1:]) / shift[:, None]
@@ -132,8 +131,8 @@ def _path(bound: Bound, dynamics: Dynamics) -> Floats:
     idle, stocks = supply.idle(actuators.agents), [bound.initial]
     for step, actions in enumerate(bound.actions):
         interval = np.array([step])
-        controls = supply(masses, inner, actuators.controls(actions[:, None], interval), interval, idle)
-        masses = dynamics.advance(masses, inner, controls, interval).stock
+        controls = actuators.controls(actions[:, None], interval)
+        masses = supply.advance(masses, inner, controls, interval, idle)[1].stock
         stocks.append(masses[dynamics.rows.nodes, 0])
     return np.array(stocks)
 
