@@ -9,6 +9,7 @@ import numpy as np
 
 from cirl_marl.compartments.incinerator import Incinerator
 from cirl_marl.controllers.basic import Arrays, Constant, Controller
+from cirl_marl.controllers.feedback import FeedbackRules
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import ControlError
 from cirl_marl.network import Floats
@@ -113,18 +114,23 @@ SCRIPTS: dict[str, Script] = {"fetch": fetch, "reacher": reacher, "delivery_truc
 
 
 class ScriptController(Controller):
-    """Acts by the script for the agent's kind of model; agents without one, and those held constant, do not listen."""
+    """Acts by the agent's rule, or the script for its kind of model; others, and those held constant, do not listen."""
 
-    def __init__(self, constant: Mapping[str, float] | None = None) -> None:
-        """Hold the actions of some agents, agent → value in [−1, 1]; others without a script stay neutral."""
-        self._constant = Constant(constant)
+    def __init__(self, constant: Mapping[str, float] | None = None, *, margin: float = 1.0) -> None:
+        """Hold the actions of some agents, agent → value in [−1, 1]; others without a script stay neutral.
+
+        All that rules aim at is multiplied by ``margin``.
+        """
+        self._constant, self._margin = Constant(constant), margin
         self._constant_agents = frozenset(constant or ())
         self._scripts: dict[str, tuple[Script, CompartmentModel, dict[str, int]]] = {}
+        self._rules: FeedbackRules | None = None
 
     def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Find the script of each agent and what it reads; those held constant are refused as by ``Constant``."""
         self._constant.start(env, seed)
         self._scripts, self._env = {}, env
+        self._rules = FeedbackRules(env, self._constant_agents, margin=self._margin)
         for agent in env.agents:
             compartment = env.network.compartments[agent]
             model, control = compartment.model, compartment.control
@@ -142,12 +148,14 @@ class ScriptController(Controller):
 
     @property
     def script_agents(self) -> tuple[str, ...]:
-        """Agents for whom a script acts; none before ``start``."""
-        return tuple(self._scripts)
+        """Agents for whom a script or a rule acts; none before ``start``."""
+        return (*self._scripts, *(self._rules.agents if self._rules else ()))
 
     def act(self, observations: Arrays) -> Arrays:
         """Return each agent's action; a ``ControlError`` names a state that its script needs and it does not see."""
         actions = dict(self._constant.act(observations))
+        if self._rules is not None and self._rules.agents:
+            actions |= self._rules.actions(actions)
         for agent, (script, model, columns) in self._scripts.items():
             states = {name: observations[agent][:, i].astype(np.float64) for name, i in columns.items()}
             try:

@@ -27,6 +27,8 @@ from cirl_marl.network.units import factor
 
 FLOW_KEYS = ("rate", "flow", "batches")
 """Keys of which a law needs one, if it takes any of them."""
+SUBRECORDS = {"lifetime": elements.Lifetime, "rule": elements.FeedbackRule}
+"""What tables within those of compartments become that need nothing else."""
 CONSTANT = "cannot change in time; fix the time, too, in 'where', and leave no column of times"
 UNCERTAINTY = ("deviation", "range", "distribution", "disturbed_by", "disturbed_as")
 """Keys that say how a quantity is not certain."""
@@ -140,8 +142,8 @@ class Converter:
             if value != int(value):
                 self.mistakes.append(f"{path}: {value} must be a whole number of control intervals")
             return int(value)
-        if isinstance(declaration, Subtable) and declaration.of == "lifetime":
-            return self._part(elements.Lifetime, entry, path)
+        if isinstance(declaration, Subtable) and declaration.of in SUBRECORDS:
+            return self._part(SUBRECORDS[declaration.of], entry, path)
         if isinstance(entry, Range):
             assert isinstance(declaration, Numbers)
             scale = self._factor(entry.unit, declaration.of, path)

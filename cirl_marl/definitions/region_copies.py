@@ -23,6 +23,8 @@ NAME_KEYS: Mapping[str, tuple[str, ...]] = {
     "disturbances": ("observed_by",),
 }
 """The tables that are copied, and their keys that name nodes, arcs or services."""
+RULE_KEYS = ("follows", "watches")
+"""Keys of a rule, likewise."""
 COMPARTMENTS = {"nodes": Node, "arcs": Arc}
 Document = Mapping[str, Any]
 
@@ -174,6 +176,8 @@ def _copy(pattern: Document, region: str, text: str) -> dict[str, Any]:
         for id_, table in pattern.get(part, {}).items():
             entries = _with_disturbances(_with_region(table, text), region, pattern.get("disturbances", {}))
             entries |= {key: rename(entries[key]) for key in keys if key in entries}
+            if isinstance(rule := entries.get("rule"), Mapping):
+                entries["rule"] = {**rule, **{key: rename(rule[key]) for key in RULE_KEYS if key in rule}}
             if part != "disturbances":
                 entries["title"] = f"{text}: {entries.get('title', id_)}"
             if part in COMPARTMENTS and "scale" not in entries:

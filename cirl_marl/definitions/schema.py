@@ -42,6 +42,7 @@ from cirl_marl.network.elements import (
     Arc,
     Control,
     Episode,
+    FeedbackRule,
     Lifetime,
     Node,
     Objective,
@@ -136,7 +137,9 @@ def _field_type(declaration: Declaration, hint: Any) -> Any:
         }
         return tables[declaration.table_form] if declaration.table_form else None
     if isinstance(declaration, Subtable):
-        return {"control": ControlTable, "lifetime": LifetimeTable, "model": ModelTable}[declaration.of]
+        return {"control": ControlTable, "lifetime": LifetimeTable, "model": ModelTable, "rule": RuleTable}[
+            declaration.of
+        ]
     if isinstance(declaration, CalendarTime):
         return Time
     if isinstance(declaration, Quantity) and declaration.unit_of_table:
@@ -176,6 +179,7 @@ ControlTable = table_of(
     },
 )
 LifetimeTable = table_of(Lifetime)
+RuleTable = table_of(FeedbackRule)
 NodeTable = table_of(Node)
 ArcTable = table_of(Arc)
 ServiceTable = table_of(Service)

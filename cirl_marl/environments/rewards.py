@@ -81,6 +81,18 @@ class Scoring:
         self._weighted_shortfall = RowSum([0] * len(services), rows, [s.weight for s in services], shape)
         self._sum_of_levels = RowSum([0] * len(services), rows, 1.0, shape)
 
+    def lack(self, quantities: Floats, step: Integers, factors: Floats | None = None) -> Floats:
+        """Return what each service lacks of its lower end, relative to that, shape (services, B); negative: a surplus.
+
+        It is 0 without a lower end; see ``levels``.
+        """
+        quantity, low = self._measure(quantities), self._low
+        if self._vary_in_time:
+            low = low.take(step, axis=1)
+        low = self._factors[0](low, factors)
+        ratio: Floats = np.divide(quantity, low, out=np.ones_like(quantity), where=low > 0)
+        return 1.0 - ratio
+
     def levels(self, quantities: Floats, step: Integers, factors: Floats | None = None) -> Floats:
         """Return the level of each service in [0, 1], shape (services, B), in the interval ``step`` of each copy.
 

@@ -200,6 +200,11 @@ class MultiAgentVectorEnv:
         factors = None if self._state is None else self.factors_in(step)
         return self._actuators.normalise(agent, values, step, factors).T
 
+    def control_values(self, actions: Mapping[str, ArrayLike]) -> Floats:
+        """Return the values of all controls under actions of all agents in the coming interval, (controls, B)."""
+        step = self._next_interval()
+        return self._actuators.controls(self.stack(actions), step, self.factors_in(step))
+
     @property
     def physical(self) -> State:
         """The current physical state; its arrays must not be written to. Before ``reset`` there is none."""
@@ -311,6 +316,20 @@ class MultiAgentVectorEnv:
         Their rows are those of ``dynamics.factors.ranges``.
         """
         return self.dynamics.factors(self.physical.factors, self.physical.disturbances, step)
+
+    def lacks(self) -> dict[str, Floats]:
+        """Return what is missing of what is aimed at in the coming interval, relative to that, shape (B,) each.
+
+        Of services it is what they lack now of their lower ends in that interval, of nodes what they lack of their
+        set-points; a surplus is negative.
+        """
+        state, step = self.physical, self._next_interval()
+        services = self.scoring.lack(self._quantities(state), step, self.factors_in(step))
+        lacks = dict(zip(self._services, services, strict=True))
+        for node, stock in zip(self.network.stores, self.rows.stocks(state.stock), strict=True):
+            if node.set_point:
+                lacks[node.id] = 1.0 - stock / node.set_point
+        return lacks
 
     def certain_network(self, copy: int) -> Network:
         """Return the network of the episode in a copy: certain, with all that it drew and that disturbs it.

@@ -183,7 +183,7 @@ class CalendarTime(Declaration):
 class Subtable(Declaration):
     """A part of its own, with a table of its own."""
 
-    of: Literal["control", "model", "lifetime"] = "control"
+    of: Literal["control", "model", "lifetime", "rule"] = "control"
 
 
 def declarations(record: type[Any]) -> Mapping[str, Declaration]:

@@ -159,8 +159,37 @@ class Lifetime(CheckedRecord):
         return chain_of(self.distribution, (self.deviation or self.mean) / self.mean)
 
 
+@frozen_record
+class FeedbackRule(CheckedRecord):
+    """What an agent does under scripted control, u = u₀·Π ξ_j·(1 + Σ g_i·(1 − q_i/aim_i)), within its bounds.
+
+    It knows the disturbances ξ_j of the coming interval and the quantities q_i at its start.
+    """
+
+    level: Annotated[
+        float | None,
+        Quantity("normalised action, −1 to 1, whose value is u₀; None: the neutral one", low=-1.0, high=1.0),
+    ] = None
+    follows: Annotated[tuple[str, ...], Declaration("disturbances that multiply it")] = ()
+    watches: Annotated[
+        tuple[str, ...],
+        Declaration("nodes, whose stocks are aimed at their set-points, and services, aimed at their lower ends"),
+    ] = ()
+    gains: Annotated[
+        tuple[float, ...],
+        Numbers(
+            "g, how much more, relative to u₀, for what each of these lacks, relative to what is aimed at",
+            "(number, …)",
+            table_form="list",
+        ),
+    ] = ()
+
+
 LIFETIME = Subtable("how long what enters stays, for arcs of law ``share`` to split what leaves", of="lifetime")
 CONTROL = Subtable("its actuator; None if it cannot act")
+RULE = Subtable(
+    "what it does under scripted control; None: stays neutral, or acts by the script of its model", of="rule"
+)
 MODEL = Subtable("inner physics; None for a plain store or transport", of="model")
 TITLE = Declaration("what it is called in tables and pictures; its id if left out")
 INNER = Numbers(
@@ -180,6 +209,7 @@ class Compartment(CheckedRecord):
     set_point: float | None = None
     scale: float = 1.0
     control: Annotated[Control | None, CONTROL] = None
+    rule: Annotated[FeedbackRule | None, RULE] = None
     model: Annotated[CompartmentModel | None, MODEL] = None
     inner: Annotated[tuple[Pair, ...], INNER] = ()
     reward_scale: Annotated[float, Positive("the model's reward is divided by it")] = 1.0

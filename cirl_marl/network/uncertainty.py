@@ -289,6 +289,9 @@ def draw_network(network: Any, factors: Sequence[float] = (), path: Floats | Non
     for node in network.stores:
         if node.initial is None and node.history is None:
             change(node, "initial", tuple(initial[node.id]))
+    for part in (*network.nodes, *network.arcs):
+        if part.rule is not None:
+            change(part, "rule", None)  # it follows disturbances, which there are no more
 
     def with_draws(part: Any) -> Any:
         return replace(part, **changes[id(part)][1]) if id(part) in changes else part

@@ -27,6 +27,7 @@ PARTS: dict[str, tuple[Any, str]] = {
     "arc": (schema.ArcTable, "`[arcs.NAME]`"),
     "control": (schema.ControlTable, "`control` of a node or an arc"),
     "lifetime": (schema.LifetimeTable, "`lifetime` of a node"),
+    "rule": (schema.RuleTable, "`rule` of a node or an arc"),
     "model": (schema.ModelTable, "`model` of a node or an arc"),
     "service": (schema.ServiceTable, "`[services.NAME]`"),
     **{kind: (table, f'`[disturbances.NAME]` with `kind = "{kind}"`') for kind, table in schema.DISTURBANCES.items()},

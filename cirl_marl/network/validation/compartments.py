@@ -10,7 +10,17 @@ import numpy as np
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network.compartment_model import CompartmentModel, OutflowModel, ReleasingModel, Vehicle
 from cirl_marl.network.declarations import LARGEST, bound_problems, default_of
-from cirl_marl.network.elements import LAW_FIELDS, MAX_STEPS, Arc, Compartment, Control, ControlKind, Law, Node
+from cirl_marl.network.elements import (
+    LAW_FIELDS,
+    MAX_STEPS,
+    Arc,
+    Compartment,
+    Control,
+    ControlKind,
+    FeedbackRule,
+    Law,
+    Node,
+)
 from cirl_marl.network.series import Series, extremes
 from cirl_marl.network.specification import Specification
 from cirl_marl.network.units import factor
@@ -136,6 +146,24 @@ def _common_problems(subject: str, compartment: Compartment, network: Specificat
         yield from _model_problems(subject, compartment, compartment.model)
     if compartment.control is not None:
         yield from _control_problems(subject, compartment, compartment.control, network)
+    if compartment.rule is not None:
+        yield from _rule_problems(f"{subject}: rule", compartment, compartment.rule, network)
+
+
+def _rule_problems(subject: str, compartment: Compartment, rule: FeedbackRule, network: Specification) -> Iterator[str]:
+    if compartment.control is None or compartment.control.kind is ControlKind.INPUT:
+        yield f"{subject}: needs a control that is no input of a model"
+    yield from bound_problems(rule, f"{subject}: ")
+    aims = [node.id for node in network.nodes if node.stores and node.set_point]
+    aims += [service.id for service in network.services]
+    disturbing = {disturbed.by for disturbed in network.disturbed.values()}
+    names = [name for name in network.disturbances if name in disturbing]
+    for key, options, what in (("follows", names, "disturbance that disturbs something"), ("watches", aims, "aim")):
+        for name in getattr(rule, key):
+            if name not in options:
+                yield f"{subject}.{key}: {unknown_name(what, name, options)}"
+    if len(rule.gains) != len(rule.watches):
+        yield f"{subject}: needs a gain for each of what it watches, got {len(rule.gains)} for {len(rule.watches)}"
 
 
 def _control_problems(
