@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -187,28 +188,27 @@ ACCOUNTING = [name for name in ("slurmdbd", "mariadbd") if shutil.which(name) is
 
 
 @pytest.fixture(scope="module", params=["plain", "accounting"])
-def node(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def node(request: pytest.FixtureRequest) -> Iterator[str]:
     """Set up a Slurm of one node, without and with accounting."""
     missing = MISSING + (ACCOUNTING if request.param == "accounting" else [])
     if missing or os.geteuid():
         pytest.skip(f"a Slurm of one node needs root and the programs {', '.join(missing) or 'that are there'}")
-    folder = tmp_path_factory.mktemp("slurm")
-    for parent in (folder, *folder.parents):
-        if parent.stat().st_mode & 0o005 == 0o005:
-            break
-        parent.chmod(0o755)  # the servers' own users look into it
-    script = ["bash", str(TESTS / "slurm_node.sh"), str(folder), request.param]
     before = os.environ.copy()
-    try:
-        with (folder / "setup.log").open("w") as log:  # servers keep it open, for which a pipe would wait
-            subprocess.run(script, check=True, stdout=log, stderr=log, timeout=180)
-        os.environ["SLURM_CONF"] = str(folder / "slurm.conf")
-        os.environ["PYTHONPATH"] = os.pathsep.join([str(TESTS), str(TESTS.parent)])
-        yield request.param
-    finally:
-        os.environ.clear()
-        os.environ.update(before)
-        subprocess.run([*script[:3], "stop"], check=True, capture_output=True)
+    # not among those of pytest, which any other session of pytest closes to the servers' own users
+    with tempfile.TemporaryDirectory(prefix="slurm-", ignore_cleanup_errors=True) as folder:
+        script = ["bash", str(TESTS / "slurm_node.sh"), folder, request.param]
+        log = Path(folder) / "setup.log"
+        try:
+            with log.open("w") as file:  # servers keep it open, for which a pipe would wait
+                done = subprocess.run(script, check=False, stdout=file, stderr=file, timeout=300)
+            assert done.returncode == 0, log.read_text()
+            os.environ["SLURM_CONF"] = f"{folder}/slurm.conf"
+            os.environ["PYTHONPATH"] = os.pathsep.join([str(TESTS), str(TESTS.parent)])
+            yield request.param
+        finally:
+            os.environ.clear()
+            os.environ.update(before)
+            subprocess.run([*script[:3], "stop"], check=True, capture_output=True)
 
 
 @pytest.mark.slow
