@@ -1,6 +1,6 @@
 """What large yearly networks cost: memory, a simulated year, the linear program of the bound; ``benchmarks/README.md``.
 
-python -m benchmarks.large              # networks of 1 386 to a million arcs (10 minutes or so), and programs
+python -m benchmarks.large              # networks of 1 386 to a million arcs, and programs
 python -m benchmarks.large --regions 33              # one of them, here, as a line of JSON
 python -m benchmarks.large --regions 33 --program    # its program
 python -m benchmarks.large --markets 3000            # markets that pass to each other at random
