@@ -93,6 +93,7 @@ if TYPE_CHECKING:
     from cirl_marl.optimum.mpc import MPC as MPC
     from cirl_marl.optimum.planned_episodes import Plan as Plan
     from cirl_marl.optimum.planned_episodes import simulate_plan as simulate_plan
+    from cirl_marl.optimum.smooth import smooth_plan as smooth_plan
     from cirl_marl.reasons.explanation import explain as explain
     from cirl_marl.reasons.inverse import infer as infer
     from cirl_marl.report.presentation import draw as draw
@@ -142,6 +143,7 @@ _MODULES = {
     "optimum.improve": "improve_plan",
     "optimum.mpc": "MPC",
     "optimum.planned_episodes": "Plan simulate_plan",
+    "optimum.smooth": "smooth_plan",
     "reasons.explanation": "explain",
     "reasons.inverse": "infer",
     "report.presentation": "draw summarise write_report",

@@ -84,7 +84,7 @@ def test_plans_of_large_networks_make_up_for_what_lacked(monkeypatch: pytest.Mon
     """Without any Jacobian the plan serves more than that of the bound, and is worth more by the same merit."""
     found = bound("copper_net", min_service=1.0, degree=1, horizon=40)
     monkeypatch.setattr(improve, "MOST_SLOPES", 0)
-    monkeypatch.setattr(improve, "_jacobians", None)
+    monkeypatch.setattr(improve, "jacobians", None)
     better = improve_plan(found)
     before, after = simulate_plan(found), simulate_plan(better)
     assert better.objective == found.objective

@@ -186,6 +186,10 @@ def plan(
     scenario: Scenario = None,
     seed: EpisodeSeed = None,
     min_service: MinService = None,
+    smooth: Annotated[
+        bool | None,
+        typer.Option(help="Of optimum's plans of equal worth the one with least change; default: unless it is large."),
+    ] = None,
     html: Html = None,
 ) -> None:
     """Write what a policy or controller does in one episode, beside business as usual, and what that saves.
@@ -203,7 +207,15 @@ def plan(
         raise CirlError(f"--out {out}: needs the name of a .csv file")
     page = page_for(html)
     with bar("planning") as progress:
-        schedule = plans.plan(source, control, scenario=scenario, min_service=min_service, seed=seed, progress=progress)
+        schedule = plans.plan(
+            source,
+            control,
+            scenario=scenario,
+            min_service=min_service,
+            seed=seed,
+            smooth=smooth,
+            progress=progress,
+        )
     network = schedule.network
     stem_of_file = Path(source).resolve().name if control is None else stem(network, control)
     path = Path(f"plan_{stem_of_file}.csv") if out is None else out

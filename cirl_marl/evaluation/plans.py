@@ -28,6 +28,7 @@ def plan(
     scenario: str | None = None,
     min_service: ArrayLike | None = None,
     seed: int | None = None,
+    smooth: bool | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Schedule:
     """Return what a policy or controller does in one episode, beside business as usual.
@@ -44,6 +45,9 @@ def plan(
         min_service: mean level of every service, or of each, shape (services,), that ``mpc`` and ``optimum`` plan for,
             a share in [0, 1]; None: as much as can be had.
         seed: of the evaluation whose first episode is planned; None begins in the middle of all initial ranges.
+        smooth: whether a plan of ``optimum`` is the one nearest to business as usual, with the least change from
+            interval to interval, among those of the same λ̄ and services (``optimum.smooth``); None: unless the
+            network is large. Of other controllers, and where nothing is proved, plans stay as they are.
         progress: called with the share of the work that is done.
 
     Returns:
@@ -54,7 +58,9 @@ def plan(
         CirlError: for input that cannot be used, a controller that does not fit the network, or a solver that fails.
         RunError: if the run is incomplete.
     """
-    env, controller = _environment_and_controller(source, control, scenario, min_service)
+    if smooth is not None and control != "optimum":
+        raise CirlError("--smooth and --no-smooth go with --control optimum")
+    env, controller = _environment_and_controller(source, control, scenario, min_service, smooth)
     table = schedule(env, controller, seed=seed, progress=progress)
     name = type(control).__name__ if isinstance(control, Controller) else control or ""
     return replace(table, control=name, note=controller.note, proof=_proof(controller, table))
@@ -85,6 +91,7 @@ def _environment_and_controller(
     control: str | Controller | None,
     scenario: str | None,
     min_service: ArrayLike | None,
+    smooth: bool | None,
 ) -> tuple[MultiAgentVectorEnv, Controller]:
     """Return one copy of the environment, and who acts in it."""
     run = _run_of(source)
@@ -92,7 +99,9 @@ def _environment_and_controller(
         if isinstance(source, RunDirectory) or (run is not None and (run.path / "config.json").is_file()):
             raise CirlError(f"plan {source}: is a training run, which acts by its policies; leave out --control")
         env = MultiAgentVectorEnv(source, num_envs=1, scenario=scenario)
-        return env, named_controller(control, min_service=min_service) if isinstance(control, str) else control
+        if isinstance(control, str):
+            control = named_controller(control, min_service=min_service, smooth=smooth)
+        return env, control
     if run is None:
         name = source.name if isinstance(source, Network) else source
         raise CirlError(f"plan {name}: which control? --control {'|'.join(CONTROLLERS)}; only a run has policies")

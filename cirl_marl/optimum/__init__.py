@@ -6,6 +6,7 @@ from cirl_marl.optimum.certificate import Certificate, Verification
 from cirl_marl.optimum.cross_entropy import Incumbent, search, search_each, standard_candidates
 from cirl_marl.optimum.improve import improve_plan
 from cirl_marl.optimum.planned_episodes import Plan, simulate_plan
+from cirl_marl.optimum.smooth import smooth_plan
 
 __all__ = [
     "Bound",
@@ -22,5 +23,6 @@ __all__ = [
     "search",
     "search_each",
     "simulate_plan",
+    "smooth_plan",
     "standard_candidates",
 ]

@@ -25,7 +25,7 @@ from scipy import sparse
 from cirl_marl.controllers.basic import Arrays, Planner
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, ControlError
-from cirl_marl.network import Floats
+from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.uncertainty import expected_network
 from cirl_marl.optimum.admissible import Admissible, NoCertificate, normalised_actions
@@ -35,6 +35,7 @@ from cirl_marl.optimum.improve import improve_plan
 from cirl_marl.optimum.options import check_options, demanded_levels
 from cirl_marl.optimum.planned_episodes import Plan, starting_states
 from cirl_marl.optimum.program import Program, Programs
+from cirl_marl.optimum.smooth import MOST_ROWS, program_rows, smooth_plan
 from cirl_marl.optimum.solver import Basis, Infeasible, Solution, SolverFailure, solve
 
 SERVICE_FIRST = 1000.0
@@ -274,9 +275,21 @@ class Optimum(Planner):
 
     ahead = 0.99
 
-    def __init__(self, *, min_service: ArrayLike | None = None, service_weight: float | None = None) -> None:
-        """Choose the objective; see ``bound``."""
-        self._min_service, self._service_weight = min_service, service_weight
+    def __init__(
+        self,
+        *,
+        min_service: ArrayLike | None = None,
+        service_weight: float | None = None,
+        smooth: bool | None = False,
+    ) -> None:
+        """Choose the objective; see ``bound``.
+
+        Args:
+            min_service: see ``bound``.
+            service_weight: likewise.
+            smooth: whether ``smooth_plan`` has the last word; None: where ``program_rows`` is at most MOST_ROWS.
+        """
+        self._min_service, self._service_weight, self._smooth = min_service, service_weight, smooth
         self.plans: list[Bound] | list[Incumbent] = []
         self._plan = Plan(())
 
@@ -289,9 +302,14 @@ class Optimum(Planner):
             CirlError: for a service that no plan reaches, a solver that fails, or an environment in which nobody acts.
         """
         try:
-            self.plans, self.note = self._bound_plans(env, progress), ""
+            network, notes = expected_network(env.network), []
             if env.network.disturbed:
-                self.note = "plans for what disturbances are expected to be, carried out whatever they are"
+                notes.append("plans for what disturbances are expected to be, carried out whatever they are")
+            is_small = (rows := program_rows(network)) <= MOST_ROWS
+            if self._smooth is None and not is_small:
+                notes.append(f"not made smooth: that program has {rows:,} rows; beyond {MOST_ROWS:,} ask for it")
+            smooth = is_small if self._smooth is None else self._smooth
+            self.plans, self.note = self._bound_plans(env, network, smooth, progress), "; ".join(notes)
         except NoCertificate as reason:
             self.plans = self._search_plans(env, progress)
             self.note = f"best plan found, no certificate: {reason}"
@@ -302,9 +320,10 @@ class Optimum(Planner):
         """Return the planned actions of the next interval."""
         return self._plan.act(observations)
 
-    def _bound_plans(self, env: MultiAgentVectorEnv, progress: Callable[[float], None]) -> list[Bound]:
+    def _bound_plans(
+        self, env: MultiAgentVectorEnv, network: Network, smooth: bool, progress: Callable[[float], None]
+    ) -> list[Bound]:
         plans: list[Bound] = []
-        network = expected_network(env.network)
         by_start: dict[bytes, Bound] = {}  # copies that start alike have the same plan, though their draws differ
         for copy, start in enumerate(env.physical.stock[env.rows.nodes].T):
 
@@ -318,7 +337,8 @@ class Optimum(Planner):
             service, weight = self._min_service, self._service_weight
             solution = bound(network, start, min_service=service, service_weight=weight, agents=env.agents or None)
             report(0.0)
-            plans.append(replace(improve_plan(solution, progress=report), network=env.network))
+            plan = improve_plan(solution, progress=report)
+            plans.append(replace(smooth_plan(plan) if smooth else plan, network=env.network))
             by_start[key] = plans[-1]
         return plans
 

@@ -17,7 +17,11 @@ CONTROLLERS = ("neutral", "constant", "random", "scripted", "lqr", "mpc", "optim
 
 
 def named_controller(
-    name: str, *, constants: Mapping[str, float] | None = None, min_service: ArrayLike | None = None
+    name: str,
+    *,
+    constants: Mapping[str, float] | None = None,
+    min_service: ArrayLike | None = None,
+    smooth: bool | None = False,
 ) -> Controller:
     """Return a controller, not yet started.
 
@@ -26,6 +30,7 @@ def named_controller(
         constants: agent → constant value in [−1, 1], of a constant or scripted controller.
         min_service: mean level of every service, or of each, shape (services,), that ``mpc`` and ``optimum`` plan for;
             None: as much as can be had.
+        smooth: whether the plans of ``optimum`` are to change little; see ``Optimum``.
 
     Raises:
         CirlError: for an unknown name, or options that the controller does not take.
@@ -40,8 +45,10 @@ def named_controller(
         # solvers are loaded by those who ask for them
         from cirl_marl.optimum.mpc import MPC, SERVICE_FIRST, Optimum
 
-        planner: type[MPC | Optimum] = MPC if name == "mpc" else Optimum
-        return planner(min_service=min_service, service_weight=SERVICE_FIRST if min_service is None else None)
+        weight = SERVICE_FIRST if min_service is None else None
+        if name == "mpc":
+            return MPC(min_service=min_service, service_weight=weight)
+        return Optimum(min_service=min_service, service_weight=weight, smooth=smooth)
     makers: Mapping[str, Callable[[], Controller]] = {
         "neutral": Neutral,
         "constant": lambda: Constant(constants),
