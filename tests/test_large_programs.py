@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import pickle
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy import sparse
+from small_networks import cycle
 
 from cirl_marl import load_network
 from cirl_marl.optimum import bound, improve, improve_plan, program, reach, simulate_plan, solver
@@ -92,3 +94,24 @@ def test_plans_of_large_networks_make_up_for_what_lacked(monkeypatch: pytest.Mon
     assert lacking[0] > 5e-4 and lacking[1] < 1e-4
     charged = prices(found)
     assert penalised_objective(found, after, charged) > penalised_objective(found, before, charged)
+
+
+def test_what_stocks_can_be_is_compiled_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bound, its better plans and what it proves elsewhere share the routes; what is sent elsewhere leaves them."""
+    compiled: list[int] = []
+    compile_routes = reach.RouteBounds.__init__
+
+    def counted(routes: reach.RouteBounds, ranges: Any, visit_bounds: Any, step: int, wider: Any = None) -> None:
+        compiled.append(step)
+        compile_routes(routes, ranges, visit_bounds, step, wider)
+
+    monkeypatch.setattr(reach.RouteBounds, "__init__", counted)
+    monkeypatch.setattr(improve, "MOST_SLOPES", 0)
+    found = bound(cycle(), min_service=0.7, degree=1)
+    once = list(compiled)
+    assert once and len(once) == len(set(once))
+    better = improve_plan(found)
+    assert found.at() == found.objective and compiled == once
+    copied = pickle.loads(pickle.dumps(found))
+    assert copied.at() == found.objective and compiled == 2 * once
+    np.testing.assert_array_equal(improve_plan(copied).actions, better.actions)

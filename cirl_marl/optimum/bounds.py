@@ -143,7 +143,7 @@ class Envelope:
             check_service(min_service)
             demand = demanded_levels(first.network, min_service, np.shape(min_service)[:-1])
         shape = np.broadcast_shapes(starts.shape[:-1], () if demand is None else demand.shape[:-1])
-        programs = Programs(admissible, first.degree, first.service_weight)
+        programs = Programs(admissible, first.degree, first.service_weight, system=first.problem.system)
         starts = np.broadcast_to(starts, (*shape, len(first.initial)))
         levels = None if demand is None else np.broadcast_to(demand, (*shape, demand.shape[-1]))
         bounds = np.empty(shape)

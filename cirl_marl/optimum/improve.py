@@ -141,7 +141,9 @@ def refine(
         if enough(run):
             break
         demand_ranges = replace(admissible, service_low=admissible.service_low * factor)
-        programs = Programs(demand_ranges, REFINEMENT_DEGREE, bound.service_weight, hold_controls=True)
+        programs = Programs(
+            demand_ranges, REFINEMENT_DEGREE, bound.service_weight, hold_controls=True, system=bound.problem.system
+        )
         try:
             problem = programs.program(bound.initial, bound.min_service)
             variables = solve(problem, label="the program of a better plan", certify=False).plan

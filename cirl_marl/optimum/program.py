@@ -54,6 +54,7 @@ class Program(LinearProgram):
 
     layout: Annotated[Layout, "what v is"]
     constant: Annotated[float, "what no plan changes; the objective to maximise is −cᵀv + ``constant``"]
+    system: Annotated[ComparisonSystem, "which bounds stocks; other programs of the network may have it too"]
 
     def interval_of_rows(self, matrix: Any) -> Integers:
         """Return the last interval whose variables each row of A or G is about, shape (rows,)."""
@@ -66,6 +67,7 @@ class Programs:
     Attributes:
         admissible: ranges of the flows.
         layout: of the variables of an interval.
+        system: which bounds the stocks.
     """
 
     def __init__(
@@ -76,6 +78,7 @@ class Programs:
         *,
         hold_controls: bool = False,
         merge_pieces: bool | None = None,
+        system: ComparisonSystem | None = None,
     ) -> None:
         """Write down what does not depend on the start.
 
@@ -87,13 +90,16 @@ class Programs:
                 better plans and bounds nothing.
             merge_pieces: whether an interval has fewer pieces than the simulator has substeps; None: if the program
                 were large otherwise.
+            system: of a program of the same network and agents, whatever their services demand.
         """
         self.admissible, lifetimes = admissible, admissible.lifetimes
         has_lifetimes = lifetimes.plan_network is not lifetimes.reach_network
-        chain_form = Admissible.of(lifetimes.reach_network, admissible.agents) if has_lifetimes else admissible
-        self._system = ComparisonSystem(chain_form)
-        self.layout = layout = _layout(admissible, self._system.substeps, merge_pieces, degree)
-        fast_system = ComparisonSystem(admissible) if has_lifetimes and layout.has_end_flows else self._system
+        if system is None:
+            chain_form = Admissible.of(lifetimes.reach_network, admissible.agents) if has_lifetimes else admissible
+            system = ComparisonSystem(chain_form)
+        self.system = system
+        self.layout = layout = _layout(admissible, system.substeps, merge_pieces, degree)
+        fast_system = ComparisonSystem(admissible) if has_lifetimes and layout.has_end_flows else system
         self._equal, self._under = ChainedRows(layout), ChainedRows(layout)
         for kind, ranges in admissible.ranges.items():
             equal_links, equal, under_links, under = (ProgramRows(layout) for _ in range(4))
@@ -108,7 +114,7 @@ class Programs:
             decay_rows(ranges, under_links)
             if layout.has_end_flows:
                 end_laws(ranges, equal, under)
-                quasi_steady_rows(ranges, fast_system.of_kind(kind), under_links)
+                quasi_steady_rows(ranges, fast_system.of_interval(kind), under_links)
             self._equal.add(kind, equal_links, equal)
             self._under.add(kind, under_links, under)
         self._weights, self._constant = objective(layout, service_weight)
@@ -133,7 +139,7 @@ class Programs:
         layout, admissible, network = self.layout, self.admissible, self.admissible.network
         intervals = range(network.episode.horizon) if intervals is None else intervals
         steps, period, lifetimes = len(intervals), slice(intervals.start, intervals.stop), admissible.lifetimes
-        reach, lifetime_flow = _reach(lifetimes, self._system, initial, intervals)
+        reach, lifetime_flow = _reach(lifetimes, self.system, initial, intervals)
         cut = np.where(admissible.by_schedule & ~reach.uncut, admissible.rate[1, period], 0.0)
         start, kinds = lifetimes.start_planned @ initial, admissible.kinds[period]
         equal, equal_to = self._equal.over(kinds, start, cut)
@@ -155,6 +161,7 @@ class Programs:
             layout=layout,
             cost=np.tile(-self._weights / steps, steps),
             constant=self._constant,
+            system=self.system,
             equal=equal,
             equal_to=equal_to,
             under=sparse.vstack(blocks, format="csr"),

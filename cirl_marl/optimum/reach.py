@@ -208,7 +208,7 @@ class ComparisonSystem:
             least, most = np.where(schedules, self.admissible.rate[:, interval], 0.0)
             for line, slots in delay_lines:
                 least[line.reached_arc], most[line.reached_arc] = 0.0, line.most_out(slots, step, inflow) / duration
-            linear = self.of_kind(int(self.admissible.kinds[interval]))
+            linear = self.of_interval(interval)
             node_inflow, outflow = self._by_node(most)
             stock_inflow = linear.routes.most(node_inflow)
             for _ in range(self.substeps):
@@ -248,8 +248,13 @@ class ComparisonSystem:
         )
         return inflow, outflow[: len(network.stores)]
 
-    def of_kind(self, kind: int) -> Linear:
-        """Return what is proportional to stocks in a kind of interval."""
+    def __getstate__(self) -> dict[str, object]:
+        """Leave out what is found again when it is needed, and large."""
+        return {**self.__dict__, "_routes": {}, "_linear": {}}
+
+    def of_interval(self, interval: int) -> Linear:
+        """Return what is proportional to stocks in an interval."""
+        kind = int(self.admissible.kinds[interval])
         if kind not in self._linear:
             self._linear[kind] = Linear(self.admissible.ranges[kind], self._routes_of(kind), self.substep)
         return self._linear[kind]
