@@ -117,8 +117,9 @@ def table(networks: Sequence[Network], pictures: Path | None) -> Iterator[str]:
         cases = {name: plan(network, Plan(case)) for name, case in (("before", before), ("after", after))}
         cells = [", ".join(figures) for figures in zip(*map(_figures, cases.values()), strict=True)]
         yield f"| `{network.name}` | {' | '.join(cells)} | {seconds} |"
-        for name, schedule in cases.items() if pictures is not None else ():
-            save_decisions(pictures / f"{network.name}_{name}.png", schedule, title=f"{network.name}, {name}")
+        if pictures is not None:
+            for name, schedule in cases.items():
+                save_decisions(pictures / f"{network.name}_{name}.png", schedule, title=f"{network.name}, {name}")
 
 
 def _figures(schedule: Schedule) -> Iterator[str]:
