@@ -622,6 +622,7 @@ def test_runs_that_do_not_fit(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
         (["compare", "run", "run", "--out", "new"], "the same recipe and seed 0"),
         (["plan", "run", "--control", "mpc", "--out", "new.csv"], "leave out --control"),
         (["plan", "run", "--scenario", "crisis", "--out", "new.csv"], "a run has its own scenario"),
+        (["plan", "run", "--no-smooth", "--out", "new.csv"], "--no-smooth go with --control optimum"),
         (["pareto", "bottles.toml", "--recipe", "recipe.toml", "--out", "new"], "Did you mean 'quarry'?"),
         (["train", "bottles.toml", "--recipe", "recipe.toml", "--out", "new"], "Did you mean 'quarry'?"),
         (["compare", "run", "--out", "recipe.toml"], "is a file, not a folder"),
