@@ -34,6 +34,7 @@ from cirl_marl import (
 )
 from cirl_marl.controllers import Constant, Controller, Neutral, Random
 from cirl_marl.controllers.rollout import first_seed
+from cirl_marl.evaluation import compare
 from cirl_marl.network.disturbances import BlockBootstrap, DisturbanceEffect, Gaussian, Markov
 from cirl_marl.network.innovations import innovations
 from cirl_marl.network.uncertainty import Spread, draw_network, expected_network
@@ -542,3 +543,23 @@ def test_large_programs_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(draws, "solve", None)
     with pytest.raises(CirlError, match=r"the program of a draw has \d+ variables, more than 100"):
         small_bound()
+
+
+@pytest.mark.medium
+def test_entries_have_their_gap(found: Any) -> None:
+    """Paired with the draws: to the bound for who does not foresee, and beside it to perfect information."""
+    comparison = compare((), ("neutral", "optimum"), network=found.network, bounds=False, uncertain_bound=found)
+    assert comparison.episodes == 12
+    for row in comparison.rows:
+        (entry,), figure, beside = row.entries, row.figure("expected_gap"), row.figure("foresight_gap")
+        merit = entry.circularity + (entry.rollout.episode_levels[:, 0] - DEMAND) * found.prices.service[0]
+        assert figure is not None and beside is not None
+        assert figure.value == pytest.approx((found.value - merit.mean()) / found.scale)
+        assert figure.high > 0.0
+        levels = entry.rollout.episode_levels
+        gaps = found.gaps(entry.circularity, levels, with_foresight=True)
+        assert beside.value == pytest.approx(gaps.mean())
+    with pytest.raises(CirlError, match="leave both out"):
+        compare((), ("neutral",), network=found.network, bounds=False, uncertain_bound=found, episodes=5)
+    with pytest.raises(CirlError, match="the episodes are of 'works'"):
+        compare((), ("neutral",), network=works(3), bounds=False, uncertain_bound=found)

@@ -24,9 +24,11 @@ from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum import NoCertificate, gap
+from cirl_marl.optimum.uncertain_bound import UncertainBound
 
 FIGURES = ("circularity", "gain", "service", "bound", "gap")
 EVERYWHERE = (-np.inf, np.inf)
+DRAW_GAPS = ("expected_gap", "foresight_gap")
 LIMITS = {"service": SHARE, "gap": (0.0, np.inf)}
 """Within which figures lie: the bound is proved, so that no gap is below 0."""
 SOLVER_SHARE = 0.7
@@ -50,6 +52,9 @@ class Entry:
         "what no λ̄ of an episode from the same start with at least the same mean level of each service exceeds, "
         "shape (episodes,), mass; None if nothing is proved",
     ]
+    uncertain_bound: Annotated[
+        UncertainBound | None, "the bound for who does not foresee, on draws that are the episodes"
+    ] = None
 
     @property
     def circularity(self) -> Floats:
@@ -65,6 +70,25 @@ class Entry:
     def gap(self) -> Floats | None:
         """(bound − λ̄)/|bound| of each episode, shape (episodes,); NaN where the bound is 0."""
         return None if self.bound is None else gap(self.bound, self.circularity)
+
+    @property
+    def expected_gap(self) -> Floats | None:
+        """(bound for who does not foresee − λ̄ − Σ_s μ_s (level_s − demand_s))/scale, shape (episodes,)."""
+        return (
+            None
+            if self.uncertain_bound is None
+            else self.uncertain_bound.gaps(self.circularity, self.rollout.episode_levels)
+        )
+
+    @property
+    def foresight_gap(self) -> Floats | None:
+        """The same, held against who knows the future of each episode."""
+        levels = self.rollout.episode_levels
+        return (
+            None
+            if self.uncertain_bound is None
+            else self.uncertain_bound.gaps(self.circularity, levels, with_foresight=True)
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +109,7 @@ class Row:
         return 0 < len(self.seeds) < ENOUGH_SEEDS
 
     def figure(self, name: str) -> Aggregate | None:
-        """Return one of FIGURES: over seeds the IQM of means over episodes, else the mean over episodes."""
+        """Return one of FIGURES, or a gap of DRAW_GAPS: over seeds the IQM of means over episodes, else their mean."""
         samples = [getattr(entry, name) for entry in self.entries]
         if any(sample is None for sample in samples):
             return None
@@ -145,6 +169,7 @@ def compare(
     min_service: ArrayLike | None = None,
     bounds: bool = True,
     uncertain: bool | None = None,
+    uncertain_bound: UncertainBound | None = None,
     progress: ProgressReport = lambda stage, share: None,
 ) -> Comparison:
     """Let trained policies and controllers act in the same fresh episodes.
@@ -165,6 +190,8 @@ def compare(
         bounds: whether to hold the episodes against the best possible.
         uncertain: whether each episode draws the uncertain numbers of the network, the same for everyone; each is then
             held against the best possible with the numbers that it drew. None: if it was so in the training.
+        uncertain_bound: ``bound(…, uncertain=True)`` of the same network, to which entries have a gap as well: its
+            draws are the episodes, whose number and seed it sets.
         progress: called with what is being done and the share of all that is done.
 
     Raises:
@@ -187,6 +214,8 @@ def compare(
         min_service,
         uncertain,
     )
+    if uncertain_bound is not None:
+        episodes, seed = _check_draws(uncertain_bound, env, episodes, seed), uncertain_bound.sampling.seed
     adapts, first = episodes is None and bool(env.network.disturbed), first_seed(seed)
     episodes = enough_episodes(env.network) if episodes is None else episodes
     share = 1 / (len(candidates) + (len({who_acts.name for who_acts in candidates}) if bounds else 0))
@@ -215,10 +244,28 @@ def compare(
         if candidate.run is None and candidate.name == "neutral"
     )
     entries = tuple(
-        Entry(candidate.name, candidate.seed, candidate.run, checkpoint, run, gain(run, neutral), bound)
+        Entry(
+            candidate.name, candidate.seed, candidate.run, checkpoint, run, gain(run, neutral), bound, uncertain_bound
+        )
         for candidate, checkpoint, run, bound in zip(candidates, checkpoints, rollouts, bounds_by_entry, strict=True)
     )
     return Comparison(env.network, env.agents, first, entries, baseline, unclear if adapts else None)
+
+
+def _check_draws(bound_: UncertainBound, env: MultiAgentVectorEnv, episodes: int | None, seed: int) -> int:
+    """Return the number of draws of a bound for who does not foresee, if they are the episodes."""
+    draws, network, sampling = len(bound_.values), bound_.network, bound_.sampling
+    parts = [(part.nodes, part.arcs, part.services, part.episode, part.disturbed) for part in (network, env.network)]
+    numbers, starts = sampling.numbers and bool(network.uncertain), bound_.initial is None
+    if parts[0] != parts[1] or bound_.agents != env.agents or numbers != env.uncertain or not starts:
+        raise CirlError(
+            f"uncertain_bound: it is of '{network.name}' with agents {list(bound_.agents)}, numbers "
+            f"{'drawn' if numbers else 'not drawn'} and starts {'drawn' if starts else 'given'}; the episodes are of "
+            f"'{env.network.name}' with {list(env.agents)}, numbers {'drawn' if env.uncertain else 'not drawn'}"
+        )
+    if episodes not in (None, draws) or seed not in (0, sampling.seed):
+        raise CirlError(f"uncertain_bound: its {draws} draws of seed {sampling.seed} are the episodes; leave both out")
+    return draws
 
 
 def _play(

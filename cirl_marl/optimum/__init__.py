@@ -7,6 +7,7 @@ from cirl_marl.optimum.cross_entropy import Incumbent, search, search_each, stan
 from cirl_marl.optimum.improve import improve_plan
 from cirl_marl.optimum.planned_episodes import Plan, simulate_plan
 from cirl_marl.optimum.smooth import smooth_plan
+from cirl_marl.optimum.uncertain_bound import Sampling, UncertainBound
 
 __all__ = [
     "Bound",
@@ -15,6 +16,8 @@ __all__ = [
     "Incumbent",
     "NoCertificate",
     "Plan",
+    "Sampling",
+    "UncertainBound",
     "Verification",
     "bound",
     "envelope",

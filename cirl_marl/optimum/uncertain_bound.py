@@ -129,15 +129,17 @@ class UncertainBound:
         """Numbers drawn once per episode, which the bound knows from the start and a policy does not."""
         return tuple(self.network.uncertain) if self.sampling.numbers else ()
 
-    def gaps(self, circularity: ArrayLike, levels: ArrayLike) -> Floats:
+    def gaps(self, circularity: ArrayLike, levels: ArrayLike, *, with_foresight: bool = False) -> Floats:
         """Return (bound − λ̄ − Σ_s μ_s (level_s − demand_s))/scale of each draw under a policy; its gap is their mean.
 
         Args:
             circularity: λ̄ of the episodes, shape (draws,), or (any,) of the first draws.
             levels: mean level of each service, shape (draws, services).
+            with_foresight: whether it is held against who knows the future instead.
         """
-        merit = np.asarray(circularity, dtype=float) + self.prices.service_value(np.asarray(levels, dtype=float))
-        return np.asarray((self.values[: len(merit)] - merit) / self.scale)
+        prices, values = (self.informed_prices, self.informed_values) if with_foresight else (self.prices, self.values)
+        merit = np.asarray(circularity, dtype=float) + prices.service_value(np.asarray(levels, dtype=float))
+        return np.asarray((values[: len(merit)] - merit) / self.scale)
 
     def closure(self, merit: float) -> float:
         """Return the share of the distance between perfect information and a policy that the penalty closes.
