@@ -24,6 +24,7 @@ from cirl_marl import (
     Service,
 )
 from cirl_marl.controllers.rollout import rollout
+from cirl_marl.network.elements import Lifetime
 from cirl_marl.optimum import NoCertificate, Plan, bound, envelope
 from cirl_marl.optimum.mpc import MPC
 
@@ -114,6 +115,76 @@ def test_a_short_window_sees_what_comes_after_where_the_service_is_out_of_reach(
         for horizon in (None, 4)
     )
     assert short == pytest.approx(whole, rel=0.005)
+
+
+@pytest.mark.parametrize("horizon", [None, 3])
+@pytest.mark.parametrize("scale", [1e-4, 1e4])
+def test_no_price_is_too_low_for_what_can_be_had(horizon: int | None, scale: float) -> None:
+    """The price of service rises until it is exact, however far λ̄ is from the scale of circularity."""
+    network = replace(in_use(), objective=Objective(circularity_scale=scale))
+    run = rollout(MultiAgentVectorEnv(network, num_envs=1), MPC(horizon=horizon, min_service=1.0, degree=4, replan=1))
+    assert run.episode_circularity[0] == pytest.approx(-6.0, rel=1e-3)
+    np.testing.assert_allclose(run.service, 1.0, atol=1e-4)
+
+
+def cycle(horizon: int = 12) -> Network:
+    """Return a market that primary metal and scrap feed, products that live 5 years, and what is made for abroad.
+
+    Of scrap the agent ``collection`` recycles some, and ``exports`` takes a share of the market; what the stock in use
+    lacks is mined, whoever acts.
+    """
+
+    def share(name: str, donor: str, recipient: str, least: float, most: float) -> Arc:
+        control = Control(kind=ControlKind.SHARE, low=least, neutral=(least + most) / 2, high=most)
+        return Arc(id=name, donor=donor, recipient=recipient, law=Law.SHARE, control=control)
+
+    mining = Control(kind=ControlKind.FLOW, low=0.0, neutral=0.0, high=60.0)
+    life = Lifetime(mean=5.0, deviation=1.5)
+    return Network(
+        name="cycle",
+        nodes=(
+            replace(RESERVE, initial=(1e4, 1e4)),
+            Node(id="market", stores=False),
+            Node(id="use", initial=(100.0, 100.0), lifetime=life),
+            Node(id="scrap", stores=False),
+            Node(id="abroad", role=Role.TECHNOSPHERE, initial=(0.0, 0.0)),
+            TIP,
+        ),
+        arcs=(
+            Arc(
+                id="mining",
+                donor="reserve",
+                recipient="market",
+                law=Law.CONTROLLED,
+                makes_up_for="in_use",
+                control=mining,
+            ),
+            Arc(id="to_use", donor="market", recipient="use", law=Law.SHARE),
+            share("exports", "market", "abroad", 0.05, 0.3),
+            Arc(id="discards", donor="use", recipient="scrap", law=Law.SHARE),
+            share("collection", "scrap", "market", 0.2, 0.8),
+            Arc(id="lost", donor="scrap", recipient="tip", law=Law.SHARE),
+        ),
+        services=(
+            Service(id="in_use", provider="use", quantity="stock", low=100.0),
+            Service(id="sold", provider="exports", quantity="flow", low=4.0),
+        ),
+        episode=Episode(control_interval=1.0, horizon=horizon),
+        objective=Objective(circularity_scale=20.0),
+    )
+
+
+@pytest.mark.parametrize("horizon", [None, 4])
+def test_supplies_fill_what_plans_leave_and_products_come_back(horizon: int | None) -> None:
+    """Mining fills the stock in use whatever is demanded, and windows know that what goes into use is discarded."""
+    network, agents = cycle(), ("exports", "collection")
+    run = rollout(
+        MultiAgentVectorEnv(network, num_envs=1, agents=agents), MPC(horizon=horizon, min_service=0.9, replan=2)
+    )
+    np.testing.assert_allclose(run.levels[0, 0], 1.0, atol=1e-9)
+    assert run.episode_levels[0, 1] == pytest.approx(0.9, abs=1e-3)
+    best = bound(network, min_service=[1.0 - 1e-9, 0.9], agents=agents)
+    assert 0.0 <= best.gap(run.episode_circularity[0]) < 0.005
 
 
 def test_weight_decides_whether_service_is_worth_its_price() -> None:

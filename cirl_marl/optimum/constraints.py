@@ -71,23 +71,29 @@ def flow_laws(ranges: IntervalRanges, equal: ProgramRows, under: ProgramRows) ->
     hold(2, arcs, layout.flow[moment] + arcs, column, factor)
 
 
-def held_controls(ranges: IntervalRanges, rows: ProgramRows) -> None:
-    """Add F_i − F_{i−1} − r (X_i − X_{i−1}), r = v·w·a at neutral, and the same for Z; keys (1, moment, family, index).
+def held_controls(driver: Integers, arcs: Integers, rate: Floats, valve: Floats, rows: ProgramRows) -> None:
+    """Add F_i − F_{i−1} − r (X_i − X_{i−1}), and the same for Z; keys (1, moment, family, index, interval).
 
     For a constant factor r' it is (r' − r)(X_i − X_{i−1}), a product of two differences, here held at 0.
+
+    Args:
+        driver: node that drives each arc.
+        arcs: those to be held.
+        rate: r = v·w·a near which they are expected, shape (intervals, arcs).
+        valve: the same of the valve of each node, shape (intervals, nodes).
+        rows: over these intervals.
     """
     layout, moment, valves = rows.layout, rows.layout.moment_column[1:], rows.layout.valves
-    arcs = np.flatnonzero(ranges.proportional & (ranges.rate[0] < ranges.rate[1]))
-    place = np.arange(len(valves))
+    t, place = np.arange(len(rate))[:, None, None], np.arange(len(valves))
     families = (
-        (0, arcs, layout.flow, arcs, ranges.driver[arcs], ranges.neutral_rate[arcs]),
-        (1, place, layout.valve, place, valves, ranges.neutral_valve[valves]),
+        (0, arcs, layout.flow, arcs, driver[arcs], rate[:, None, arcs]),
+        (1, place, layout.valve, place, valves, valve[:, None, valves]),
     )
-    for family, index, first, offset, driver, rate in families:
-        row = rows.add(1, moment, family, index)
+    for family, index, first, offset, node, factor in families:
+        row = rows.add(1, moment, family, index, t)
         for at, sign in ((moment, 1.0), (moment - 1, -1.0)):
-            rows.put(row, first[at] + offset, sign)
-            rows.put(row, layout.stock[at] + driver, -sign * rate)
+            rows.put(row, t * layout.size + first[at] + offset, sign)
+            rows.put(row, t * layout.size + layout.stock[at] + node, -sign * factor)
 
 
 def throughputs(ranges: IntervalRanges, rows: ProgramRows) -> None:

@@ -19,6 +19,7 @@ from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.bounds import Bound
 from cirl_marl.optimum.program import LinearProgram
+from cirl_marl.optimum.window_planner import WindowSimulator, service_measures
 
 DIFFERENCE = 1e-6
 """Step of the difference quotients, relative to the scale of a stock or to half the range of a control."""
@@ -42,7 +43,7 @@ def jacobians(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats, Floats]
     network = bound.network
     steps, entries = bound.actions.shape
     rows, nodes = dynamics.rows, dynamics.rows.nodes.stop
-    stock = _path(bound, dynamics)
+    stock = WindowSimulator(bound.network, bound.agents).run(bound.initial, bound.actions)[0]
     inputs = np.concatenate([stock[:-1], bound.actions], axis=1)
     scale = np.array([node.scale for node in dynamics.staged_network.stores])
     width = np.concatenate([np.maximum(stock.max(axis=0), scale), np.ones(entries)]) * DIFFERENCE
@@ -63,19 +64,6 @@ def jacobians(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats, Floats]
     by_interval = outputs.reshape(len(outputs), steps, -1).transpose(1, 0, 2)
     slopes = (by_interval[:, :, :-1] - by_interval[:, :, -1:]) / shift[:, None]
     return slopes[:, :, :nodes], slopes[:, :, nodes:], stock[1:]
-
-
-def _path(bound: Bound, dynamics: Dynamics) -> Floats:
-    """Return the stocks at the start and after each interval under the bound's actions, shape (steps + 1, stocks)."""
-    actuators, inner = Actuators(bound.network, bound.agents or None, 1), np.empty((0, 1))
-    masses, supply = dynamics.extend(bound.initial[:, None]), Supply(dynamics)
-    idle, stocks = supply.idle(actuators.agents), [bound.initial]
-    for step, actions in enumerate(bound.actions):
-        interval = np.array([step])
-        controls = actuators.controls(actions[:, None], interval)
-        masses = supply.advance(masses, inner, controls, interval, idle)[1].stock
-        stocks.append(masses[dynamics.rows.nodes, 0])
-    return np.array(stocks)
 
 
 @positional_record
@@ -181,16 +169,8 @@ def _diagonal(blocks: Floats, shape: tuple[int, int]) -> Any:
 
 def _measures(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats]:
     """Return what each service reads off (x', f̄), shape (services, stocks + arcs), and Δ·σ_env padded with zeros."""
-    network = bound.network
-    nodes = dynamics.rows.nodes.stop
-    measure = np.zeros((len(network.services), nodes + len(network.arcs)))
-    for s, service in enumerate(network.services):
-        if service.quantity == "stock":
-            for place in (network.node_index[node] for node in service.providers):
-                measure[s, dynamics.rows.stages.get(place, place)] = 1.0
-        else:
-            measure[s, nodes + network.service_arcs(service)] = 1.0
-    return measure, np.concatenate([np.zeros(nodes), -network.circularity_weights[1]])
+    imbalances = np.concatenate([np.zeros(dynamics.rows.nodes.stop), -bound.network.circularity_weights[1]])
+    return service_measures(bound.network, dynamics), imbalances
 
 
 def _cost(bound: Bound, size: int, level: int, nodes: int) -> Floats:

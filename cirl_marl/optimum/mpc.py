@@ -1,15 +1,15 @@
 """Controllers that plan with the program of the bound: again and again (MPC), or once for the episode (Optimum).
 
-Every ``replan`` decisions each copy solves the linear program of ``cirl_marl.optimum`` from its true current stocks and
-carries out the first planned actions; what the program promised and the simulator did not do is made up for by the
-next plan. Controls are held within an interval to first order (``Programs(hold_controls=True)``): that bounds nothing
-and plans better. Nothing is random.
+Every ``replan`` decisions each copy solves the linear program of ``cirl_marl.optimum`` from its true current stocks,
+tries the plan in the simulator, corrects it (``window_planner``), and carries out the first planned actions. Nothing is
+random.
 
 A receding window ends before the episode does. What comes after it is priced by the multipliers y of the program of the
 whole episode, solved once from the start of the episode: the rows of the interval after the window are moved into the
-objective, c' = c − Aᵀy, which leaves a price on each stock at the window's end. By duality this is an upper bound on
-what those stocks are worth to the rest of the episode, exact along its plan, so that nothing is run down because the
-window ends. With ``horizon=None`` the window shrinks with what is left of the episode and needs no prices.
+objective, c' = c − Aᵀy, which leaves a price on each stock at the window's end and on what goes into use. By duality
+this is an upper bound on what those are worth to the rest of the episode, exact along its plan, so that nothing is run
+down because the window ends. Prices that are linear leave many plans equal; of these the one that ends nearest to the
+plan of the episode is taken. With ``horizon=None`` the window shrinks with what is left of the episode.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import sparse
 
 from cirl_marl.controllers.basic import Arrays, Planner
 from cirl_marl.environments.vector import MultiAgentVectorEnv
@@ -28,68 +27,31 @@ from cirl_marl.errors import CirlError, ControlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.uncertainty import expected_network
-from cirl_marl.optimum.admissible import Admissible, NoCertificate, normalised_actions
+from cirl_marl.optimum.admissible import Admissible, NoCertificate
 from cirl_marl.optimum.bounds import Bound, bound
 from cirl_marl.optimum.cross_entropy import KNOTS, Incumbent, search_each
 from cirl_marl.optimum.improve import improve_plan
 from cirl_marl.optimum.options import check_options, demanded_levels
 from cirl_marl.optimum.planned_episodes import Plan, starting_states
-from cirl_marl.optimum.program import Program, Programs
 from cirl_marl.optimum.smooth import MOST_ROWS, program_rows, smooth_plan
-from cirl_marl.optimum.solver import Basis, Infeasible, Solution, SolverFailure, solve
+from cirl_marl.optimum.solver import SolverFailure
+from cirl_marl.optimum.window_planner import WindowPlanner
+from cirl_marl.optimum.windows import Continuation, WindowPlan, WindowTask
 
 SERVICE_FIRST = 1000.0
-"""Weight of the mean service level, against λ̄/circularity_scale, where a demanded level is out of reach."""
+"""Weight of the mean service level, against λ̄/circularity_scale, at which service comes first."""
 BOUND = 0.3
 """About the share of solving for the bound in the work on a plan; the rest is to improve it."""
 
 
 @positional_record
 class _Plan:
-    """What is planned for one copy."""
+    """What one copy carries out."""
 
     episode: Annotated[int, "of the copy, by its number"]
-    intervals: Annotated[range, "of the episode"]
-    optimum: Annotated[tuple[Program, Solution] | None, "of which program, and which; None if nothing could be planned"]
-    actions: Annotated[Floats, "of the first intervals, shape (decisions, entries)"]
-    unit: Annotated[float, "what 1 of its objective is in the objective of plans that meet the demand"]
-
-    def basis(self, intervals: range) -> Basis | None:
-        """Return the basis from which to plan ``intervals``; None if they are neither as many nor the last of these."""
-        if self.optimum is None or self.optimum[1].basis is None:
-            return None
-        problem, basis = self.optimum[0], self.optimum[1].basis
-        if len(intervals) == len(self.intervals):
-            return basis
-        if intervals.stop != self.intervals.stop or intervals.start < self.intervals.start:
-            return None
-        return basis.without_first(problem, intervals.start - self.intervals.start)
-
-    def levels(self) -> Floats:
-        """Return the planned level of each service in each interval, shape (intervals, services)."""
-        assert self.optimum is not None
-        layout = self.optimum[0].layout
-        return self.optimum[1].plan.reshape(-1, layout.size)[:, layout.level : layout.imbalance]
-
-    def prices(self) -> Floats:
-        """Return what the rows of the next interval charge for the stocks at the end of each, shape (intervals, nodes).
-
-        They are the terms of c − Aᵀy − Gᵀμ, for those stocks, of rows that belong to the interval after, in the
-        objective of plans that meet the demand.
-        """
-        assert self.optimum is not None
-        problem, certificate, layout = self.optimum[0], self.optimum[1].certificate, self.optimum[0].layout
-        costs = np.zeros(len(problem.cost))
-        for matrix, multipliers in ((problem.equal, certificate.equal), (problem.under, certificate.under)):
-            # entry (row, column): the row belongs to the last interval that it touches, the column to its own
-            entries = matrix.tocoo()
-            interval = entries.col // layout.size
-            ends = entries.col - interval * layout.size
-            later = problem.interval_of_rows(matrix)[entries.row] > interval
-            later &= (ends >= layout.last.start) & (ends < layout.last.stop)
-            np.subtract.at(costs, entries.col[later], (entries.data * multipliers[entries.row])[later])
-        prices: Floats = costs.reshape(-1, layout.size)[:, layout.last]
-        return prices * self.unit
+    first: Annotated[int, "interval of the episode in which the actions begin"]
+    actions: Annotated[Floats, "of the next intervals, shape (decisions, entries)"]
+    window: Annotated[WindowPlan | None, "what they are the first of; None if nothing could be planned"]
 
 
 class MPC(Planner):
@@ -97,8 +59,9 @@ class MPC(Planner):
 
     The objective is λ̄ of the episode; with ``service_weight`` w, λ̄/circularity_scale + w·service. With ``min_service``
     the mean level of each service over the whole episode is held at the demanded level or above: what the past
-    intervals lacked the planned ones have to make up for. If that is out of reach for one of them, w = SERVICE_FIRST
-    takes the place of the demand in that plan. It then comes as close as it can: no service counts beyond its demand.
+    intervals lacked the planned ones have to make up for. What is out of reach is asked for as far as it can be had; no
+    service counts beyond its demand. A service that arcs make up for while nobody acts on them is planned in full, as
+    they will supply it.
     """
 
     ahead = 0.1  # a first plan takes longer than the later ones, which start from it
@@ -145,10 +108,11 @@ class MPC(Planner):
         self._levels = None if self._min_service is None else demanded_levels(network, self._min_service)
         self.note = ""
         self._env = env
-        self._admissible = Admissible.of(expected_network(network), env.agents or None)
-        self._programs = Programs(self._admissible, self._degree, self._weight, hold_controls=True)
-        self._urgent = Programs(self._admissible, self._degree, SERVICE_FIRST, hold_controls=True)
-        self._outlooks: dict[int, _Plan] = {}
+        admissible = Admissible.of(expected_network(network), env.agents or None)
+        self._planner = WindowPlanner(admissible, self._degree, self._weight)
+        supplies = {arc.makes_up_for for arc in network.arcs if arc.makes_up_for and arc.id not in env.agents}
+        self._full = np.array([service.id in supplies for service in network.services], dtype=bool)
+        self._outlooks: dict[int, WindowPlan] = {}
         self._plans = []
         for copy in range(env.num_envs):
             self._plans.append(self._next(copy, None))
@@ -166,9 +130,9 @@ class MPC(Planner):
             plan = self._plans[copy]
             if plan.episode != env.episodes[copy]:
                 plan = self._plans[copy] = self._next(copy, None)
-            elif not 0 <= step - plan.intervals.start < len(plan.actions):
+            elif not 0 <= step - plan.first < len(plan.actions):
                 plan = self._plans[copy] = self._next(copy, plan)
-            actions.append(plan.actions[step - plan.intervals.start])
+            actions.append(plan.actions[step - plan.first])
         return env.unstack(np.stack(actions, axis=1))
 
     def _next(self, copy: int, last: _Plan | None) -> _Plan:
@@ -179,47 +143,49 @@ class MPC(Planner):
             raise ControlError(f"MPC: the episode is over after {steps} steps: call reset()")
         rest = range(step, steps)
         window = rest if self._horizon is None else rest[: self._horizon]
+        earlier = None if last is None else last.window
         try:
-            return self._solve_window(copy, rest, window, last)
+            planned = self._solve_window(copy, rest, window, earlier)
         except SolverFailure as failure:
             self.note = f"MPC goes on as it planned before, or neutrally, where a plan is missing: {failure}"
-            return self._older(copy, window, last)
+            return self._older(copy, step, earlier)
+        return _Plan(int(self._env.episodes[copy]), step, planned.actions[: self._replan], planned)
 
-    def _solve_window(self, copy: int, rest: range, window: range, last: _Plan | None) -> _Plan:
+    def _solve_window(self, copy: int, rest: range, window: range, last: WindowPlan | None) -> WindowPlan:
         """Plan the ``window`` of what is left of the episode, the ``rest``."""
         state, steps = self._env.physical, self._env.network.episode.horizon
         deficit = None if self._levels is None else self._levels * steps - state.service[:, copy]
-        if len(window) == len(rest):
-            return self._plan(copy, window, deficit, last.basis(window) if last else None)
         if last is None:
             self._outlooks.pop(copy, None)
+        if len(window) == len(rest):
+            return self._plan(copy, window, deficit, last)
         if copy not in self._outlooks:
-            self._outlooks[copy] = self._plan(copy, rest, deficit, None, as_outlook=True)  # its multipliers are prices
+            self._outlooks[copy] = self._plan(copy, rest, deficit, None, is_outlook=True)
         outlook = self._outlooks[copy]
-        after = window.stop - outlook.intervals.start
+        after = window.stop - outlook.task.intervals.start
         if deficit is not None:
-            deficit -= outlook.levels()[after:].sum(axis=0)
-        return self._plan(copy, window, deficit, last.basis(window) if last else None, outlook.prices()[after - 1])
+            deficit = deficit - outlook.levels[after:].sum(axis=0)
+        return self._plan(copy, window, deficit, last or outlook, outlook.continuation(window))
 
-    def _older(self, copy: int, window: range, last: _Plan | None) -> _Plan:
+    def _older(self, copy: int, step: int, last: WindowPlan | None) -> _Plan:
         """Return the last plan, to be carried out for longer, or one to be neutral where it has come to its end."""
-        if last is not None and last.optimum is not None and window.start in last.intervals:
-            problem, solution = last.optimum
-            done = window.start - last.intervals.start + self._replan
-            plan = solution.plan.reshape(len(last.intervals), -1)[:done]
-            return replace(last, actions=normalised_actions(self._admissible, problem.layout, plan, last.intervals))
+        episode = int(self._env.episodes[copy])
+        if last is not None and step in last.task.intervals:
+            first = step - last.task.intervals.start
+            return _Plan(episode, step, last.actions[first : first + self._replan], last)
         neutral = np.concatenate([action[copy] for action in self._env.neutral_action.values()])
-        return _Plan(int(self._env.episodes[copy]), window, None, np.tile(neutral, (self._replan, 1)), 1.0)
+        return _Plan(episode, step, np.tile(neutral, (self._replan, 1)), None)
 
     def _plan(
         self,
         copy: int,
         intervals: range,
         deficit: Floats | None,
-        basis: Basis | None,
-        prices: Floats | None = None,
-        as_outlook: bool = False,
-    ) -> _Plan:
+        last: WindowPlan | None,
+        later: Continuation | None = None,
+        *,
+        is_outlook: bool = False,
+    ) -> WindowPlan:
         """Plan some intervals.
 
         Args:
@@ -227,42 +193,18 @@ class MPC(Planner):
             intervals: to be planned.
             deficit: least sum of the levels of each service over all intervals, shape (services,); None if nothing is
                 demanded.
-            basis: from which the solver starts.
-            prices: of the stocks at the end, shape (nodes,), in the objective of plans that meet the demand, per mass.
-            as_outlook: whether the multipliers must be good, as they are the prices of later plans.
+            last: plan before, from whose basis the solver starts.
+            later: what comes after; None at the end of the episode.
+            is_outlook: whether the multipliers must be good, as they are the prices of later plans.
         """
-        env, episode = self._env, self._env.network.episode
-        stock = env.physical.stock[env.rows.nodes, copy]
-        demand = None if deficit is None else np.maximum(0.0, deficit / len(intervals))
-        task = f"the program of MPC for decisions {intervals.start} to {intervals.stop - 1}"
-        for programs, unit in ((self._programs, 1.0), (self._urgent, env.network.objective.circularity_scale)):
-            problem = programs.program(stock, demand, intervals)
-            cost = problem.cost.reshape(len(intervals), -1) * (len(intervals) / episode.horizon)
-            if prices is not None:
-                cost[-1, problem.layout.last] += prices / unit
-            problem = replace(problem, cost=cost.ravel())
-            if programs is self._urgent:
-                problem = _without_demand(problem)
-            try:
-                solution = solve(problem, basis, label=task, certify=as_outlook)
-                break
-            except Infeasible:
-                if demand is None or programs is self._urgent:
-                    raise
-        variables = solution.plan.reshape(len(intervals), -1)[: self._replan]
-        actions = normalised_actions(self._admissible, problem.layout, variables, intervals)
-        return _Plan(int(env.episodes[copy]), intervals, (problem, solution), actions, unit)
-
-
-def _without_demand(problem: Program) -> Program:
-    """Return the program in which the mean level of each service counts up to what is demanded, and is not held there.
-
-    A level is a variable of at most q/low, so that a service may be better than what is counted of it.
-    """
-    under, services = problem.under, len(problem.layout.network.services)
-    is_demand = np.arange(len(problem.under_to)) >= len(problem.under_to) - services
-    sign = np.where(is_demand, -1.0, 1.0)
-    return replace(problem, under=sparse.csr_array(sparse.diags_array(sign) @ under), under_to=problem.under_to * sign)
+        stock = self._env.physical.stock[self._env.rows.nodes, copy]
+        demand = None
+        if deficit is not None:  # no interval delivers more than all that is wanted
+            demand = np.where(self._full, 1.0, np.clip(deficit / len(intervals), 0.0, 1.0))
+        correction = None if last is None else last.corrections(intervals)
+        price = self._planner.first_price if last is None else last.task.price
+        task = WindowTask(stock, intervals, demand, later, price, correction, is_outlook)
+        return self._planner.plan(task, last.basis(intervals) if last else None, self._replan)
 
 
 class Optimum(Planner):

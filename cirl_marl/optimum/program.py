@@ -108,7 +108,8 @@ class Programs:
             flow_laws(ranges, equal, under)
             throughputs(ranges, equal)
             if hold_controls:
-                held_controls(ranges, equal)
+                held_arcs = np.flatnonzero(ranges.proportional & (ranges.rate[0] < ranges.rate[1]))
+                held_controls(ranges.driver, held_arcs, ranges.neutral_rate[None], ranges.neutral_valve[None], equal)
             delivery_limits(ranges, under_links)
             service_levels(ranges, under)
             decay_rows(ranges, under_links)

@@ -1,0 +1,261 @@
+"""Plans of some intervals of an episode: solved with a price on service, tried in the simulator, and solved again.
+
+The program relaxes what controls held within an interval can do, so that a plan promises more of a service than comes
+about, or less. With q̂ the planned quantity of a service in an interval, q what the simulator makes of the planned
+actions, and l the lower end of its band, the next program counts as its level at most
+
+    (q̂' − (q̂ − q))/l
+
+for what it plans, q̂': what was missed is raised, what was met better is not paid for twice. Of the plans tried, that
+one is carried out which does best in the simulator.
+
+The price of what services lack rises until no more of them can be had.
+
+Reference: Marchetti, Chachuat and Bonvin 2009, Industrial & Engineering Chemistry Research 48, 6022 (the model's error
+is added to its constraints).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy import sparse
+
+from cirl_marl.dynamics.integrator import Dynamics
+from cirl_marl.dynamics.supply import Supply
+from cirl_marl.environments.actuators import Actuators
+from cirl_marl.network import Floats, Network
+from cirl_marl.optimum.admissible import Admissible, normalised_actions
+from cirl_marl.optimum.constraints import held_controls
+from cirl_marl.optimum.matrices import ProgramRows
+from cirl_marl.optimum.program import Program, Programs
+from cirl_marl.optimum.solver import Basis, Solution, solve
+from cirl_marl.optimum.windows import (
+    DISTANCE,
+    Continuation,
+    Correction,
+    WindowPlan,
+    WindowTask,
+    level_columns,
+    level_rows,
+    with_distance,
+    with_lack,
+)
+
+FIRST_PRICE, RISE, RISES = 3.0, 10.0, 8
+"""The price of service that is tried first, against λ̄/circularity_scale; by what it is multiplied while more could be
+had, and how often at most."""
+SHORTFALL = 1e-6
+"""Mean level that a plan may lack of what is demanded without a higher price."""
+ROUNDS = 3
+"""Most programs for a plan, but for those with higher prices."""
+TOLERANCE = 2e-4
+"""Level by which the intervals that are carried out may miss what is planned, in the mean, without a further round."""
+
+
+class WindowSimulator:
+    """The exact motion of one copy of a network under planned actions.
+
+    Attributes:
+        dynamics: of the network.
+    """
+
+    def __init__(self, network: Network, agents: tuple[str, ...]) -> None:
+        """Compile the network for ``agents``, who act."""
+        self.dynamics = Dynamics(network)
+        self._actuators, self._supply = Actuators(network, agents or None, 1), Supply(self.dynamics)
+        self._idle = self._supply.idle(self._actuators.agents)
+
+    def run(self, stock: Floats, actions: Floats, first: int = 0) -> tuple[Floats, Floats]:
+        """Return the stocks at the start and after each interval, and the mean flows in each.
+
+        Args:
+            stock: at the start, by stage, shape (rows,).
+            actions: normalised, shape (intervals, entries).
+            first: interval of the episode that they begin in.
+
+        Returns:
+            Stocks, shape (intervals + 1, rows), mass, and flows, shape (intervals, arcs), mass/time.
+        """
+        dynamics, inner = self.dynamics, np.empty((0, 1))
+        masses, stocks, flows = dynamics.extend(stock[:, None]), [stock], []
+        for step, action in enumerate(actions, first):
+            interval = np.array([step])
+            controls = self._actuators.controls(action[:, None], interval)
+            done = self._supply.advance(masses, inner, controls, interval, self._idle)[1]
+            masses = done.stock
+            stocks.append(masses[dynamics.rows.nodes, 0])
+            flows.append(done.moved_mass[:, 0] / dynamics.network.episode.control_interval)
+        return np.array(stocks), np.array(flows)
+
+
+def service_measures(network: Network, dynamics: Dynamics) -> Floats:
+    """Return what each service reads off stocks and mean flows, shape (services, stocks + arcs)."""
+    nodes = dynamics.rows.nodes.stop
+    measure = np.zeros((len(network.services), nodes + len(network.arcs)))
+    for s, service in enumerate(network.services):
+        if service.quantity == "stock":
+            for place in (network.node_index[node] for node in service.providers):
+                measure[s, dynamics.rows.stages.get(place, place)] = 1.0
+        else:
+            measure[s, nodes + network.service_arcs(service)] = 1.0
+    return measure
+
+
+class WindowPlanner:
+    """Plans windows of a network, the better ones of which are found by trying them.
+
+    Attributes:
+        admissible: what agents can do.
+        first_price: of a unit of each service that an episode lacks, in the objective, shape (services,).
+    """
+
+    def __init__(self, admissible: Admissible, degree: int, service_weight: float | None) -> None:
+        """Write down what does not depend on the start; see ``Programs``."""
+        self.admissible = admissible
+        network = self._network = admissible.lifetimes.network
+        self._programs = Programs(admissible, degree, service_weight)
+        self._simulator = WindowSimulator(network, admissible.agents)
+        self._measure = service_measures(network, self._simulator.dynamics)
+        self._weight = service_weight
+        controlled = ~admissible.by_schedule & (admissible.rate[0] < admissible.rate[1]).any(axis=0)
+        controlled[admissible.lifetimes.exit_arcs] = False
+        self._hold = np.flatnonzero(controlled)
+        self.first_price = np.full(len(network.services), FIRST_PRICE * network.objective.circularity_scale)
+
+    def plan(self, task: WindowTask, basis: Basis | None, carried_out: int) -> WindowPlan:
+        """Return the best plan that is found, of which the first intervals will be ``carried_out``.
+
+        Raises:
+            SolverFailure: if the solver fails before there is a plan.
+        """
+        best = None
+        for _ in range(ROUNDS):
+            trial = self._trial(task, basis)
+            if best is None or trial.merit > best.merit:
+                best = trial
+            if task.correction is not None:
+                error = (trial.correction.error - task.correction.error)[:carried_out].mean(axis=0)
+                if np.abs(error).max(initial=0.0) <= TOLERANCE:
+                    break
+            basis = trial.basis(task.intervals)
+            task = replace(trial.task, correction=trial.correction)
+        assert best is not None
+        return best
+
+    def _trial(self, task: WindowTask, basis: Basis | None) -> WindowPlan:
+        """Solve the program of a task and carry its plan out in the simulator."""
+        intervals, admissible = task.intervals, self.admissible
+        task, problem, solution = self._solve(self._program(task), task, basis)
+        steps, layout = len(intervals), problem.layout
+        variables = solution.plan[: steps * layout.size].reshape(steps, -1)
+        actions = normalised_actions(admissible, layout, variables, intervals)
+        stocks, flows = self._simulator.run(task.stock, actions, intervals.start)
+        low = admissible.service_low[intervals.start : intervals.stop]
+        quantity = np.concatenate([stocks[1:], flows], axis=1) @ self._measure.T
+        level = np.divide(quantity, low, out=np.ones_like(low), where=low > 0)
+        error = np.where(low > 0, np.clip(self._quantity(problem, solution, task) - level, -1.0, 1.0), 0.0)
+        correction = Correction(error, *self._factors(variables, intervals))
+        promised = variables[:, layout.level : layout.imbalance]
+        merit = self._merit(task, flows, stocks[-1], np.minimum(level, 1.0))
+        return WindowPlan(task, problem, solution, actions, correction, promised, merit)
+
+    def _factors(self, variables: Floats, intervals: range) -> tuple[Floats, Floats]:
+        """Return the rates and valves of a plan, the neutral ones where nothing flows; see ``Correction``."""
+        admissible, layout = self.admissible, self._programs.layout
+        period = slice(intervals.start, intervals.stop)
+        stock, flow, through = layout.means(variables)
+        rate, valve = admissible.neutral_rate[period].copy(), admissible.neutral_valve[period].copy()
+        driver = stock[:, admissible.driver]
+        np.divide(flow, driver, out=rate, where=driver > 1e-12 * np.abs(flow))
+        held = stock[:, layout.valves]
+        valve[:, layout.valves] = np.divide(
+            through, held, out=valve[:, layout.valves], where=held > 1e-12 * np.abs(through)
+        )
+        return np.clip(rate, *admissible.rate[:, period]), np.clip(valve, *admissible.valve[:, period])
+
+    def _program(self, task: WindowTask) -> Program:
+        """Return the program of a task, corrected by what became of a plan before; its demand has a price."""
+        problem = self._programs.program(task.stock, task.demand, task.intervals)
+        layout, steps = problem.layout, len(task.intervals)
+        cost = problem.cost.reshape(steps, -1) * (steps / self._network.episode.horizon)
+        if task.later is not None:
+            cost += task.later.costs
+        problem = replace(problem, cost=cost.ravel())
+        if task.correction is not None:
+            rows, error = ProgramRows(layout, steps), task.correction.error
+            held_controls(self.admissible.driver, self._hold, task.correction.rate, task.correction.valve, rows)
+            low, under_to, rows_of_levels = problem.low.copy(), problem.under_to.copy(), level_rows(problem)
+            ends = self.admissible.service_low[task.intervals.start : task.intervals.stop]
+            under_to[rows_of_levels] -= (ends * error).ravel()
+            low[level_columns(problem)] = -np.maximum(error, 0.0).ravel()
+            matrix = rows.matrices()[0]
+            equal = sparse.vstack([problem.equal, matrix], format="csr")
+            equal_to = np.append(problem.equal_to, np.zeros(matrix.shape[0]))
+            problem = replace(problem, equal=equal, equal_to=equal_to, low=low, under_to=under_to)
+        if task.later is not None:
+            problem = with_distance(problem, task.later)
+        return problem if task.demand is None or not self._network.services else with_lack(problem)
+
+    def _solve(self, problem: Program, task: WindowTask, basis: Basis | None) -> tuple[WindowTask, Program, Solution]:
+        """Solve a program, with a higher price of what lacks as long as that helps; the task comes back with it."""
+        size = len(problem.cost), len(problem.equal_to) + len(problem.under_to)
+        if basis is not None and (len(basis.columns), len(basis.rows)) != size:
+            basis = None  # of a program with other rows
+        label = f"the program of MPC for decisions {task.intervals.start} to {task.intervals.stop - 1}"
+        services, price, least, same_rows = len(self.first_price), task.price, None, False
+        if task.demand is None or not services:
+            return task, problem, solve(problem, basis, label=label, certify=task.is_outlook)
+        for rise in range(RISES + 1):
+            problem.cost[-services:] = price * (len(task.intervals) / self._network.episode.horizon)
+            solution = solve(problem, basis, label=label, certify=task.is_outlook, same_rows=same_rows)
+            lack, basis, same_rows = solution.plan[-services:], solution.basis, solution.basis is not None
+            # what comes after was priced beside this price: another one would weigh the two differently
+            if lack.max() <= SHORTFALL or task.later is not None or rise == RISES:
+                break
+            if least is None:
+                only_lack = replace(problem, cost=np.repeat([0.0, 1.0], [len(problem.cost) - services, services]))
+                least = solve(only_lack, basis, label=label, certify=False, same_rows=same_rows).plan[-services:].sum()
+            if lack.sum() <= least + SHORTFALL * services:
+                break
+            price = np.where(lack > SHORTFALL, price * RISE, price)
+        if task.is_outlook:  # what turns out dearer within windows is not left undone
+            multipliers = -solution.certificate.under[-services:]
+            price = np.where(lack > SHORTFALL, price, np.maximum(price, FIRST_PRICE * multipliers))
+        return replace(task, price=price), problem, solution
+
+    def _quantity(self, problem: Program, solution: Solution, task: WindowTask) -> Floats:
+        """Return q̂/l of a plan, shape (intervals, services)."""
+        layout, steps = problem.layout, len(task.intervals)
+        plan = solution.plan
+        low = self.admissible.service_low[task.intervals.start : task.intervals.stop]
+        levels = plan[: steps * layout.size].reshape(steps, -1)[:, layout.level : layout.imbalance]
+        activity = (problem.under[level_rows(problem)] @ plan).reshape(low.shape)  # l·level − q̂
+        quantity: Floats = low * levels - activity
+        return np.divide(quantity, low, out=np.zeros_like(low), where=low > 0)
+
+    def _merit(self, task: WindowTask, flows: Floats, end: Floats, levels: Floats) -> float:
+        """Return the objective that the simulator reaches, in parts of that of the episode."""
+        network, share = self._network, len(flows) / self._network.episode.horizon
+        weights = network.circularity_weights
+        per_interval = flows @ weights.sum(axis=0)
+        if network.objective.net_zero == "abs":
+            per_interval = flows @ weights[0] - np.abs(flows @ weights[1])
+        value = float(per_interval.mean()) * share
+        if self._weight is not None:
+            value = value / network.objective.circularity_scale
+            value += self._weight * share * float(levels.mean()) if levels.size else 0.0
+        if task.later is not None:
+            value -= self._later_cost(task.later, flows, self.admissible.lifetimes.start_planned @ end)
+        if task.demand is not None:
+            value -= float(task.price @ np.maximum(0.0, task.demand - levels.mean(axis=0))) * share
+        return value
+
+    def _later_cost(self, later: Continuation, flows: Floats, end: Floats) -> float:
+        """Return what an episode of the simulator leaves to later intervals, by its last stocks and its mean flows."""
+        layout, arcs = self._programs.layout, flows.shape[1]
+        by_flow = sum(later.costs[:, first : first + arcs] for first in layout.flow.tolist())
+        price = later.costs[-1, layout.last]
+        distance = DISTANCE * np.abs(price) @ np.abs(end - later.stocks)
+        return float(price @ end + distance + np.sum(by_flow * flows))

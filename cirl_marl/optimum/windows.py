@@ -1,0 +1,155 @@
+"""The program of some intervals of an episode: what is to be planned, and what its rows have beside those of a bound.
+
+A demanded level is no row that must hold but has a price, charged per unit that the episode lacks. A price above the
+multiplier of the demand is exact: nothing is lacking that can be had.
+
+Reference: Kerrigan and Maciejowski 2000, UKACC Control (exact penalties in model predictive control).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Annotated
+
+import numpy as np
+from scipy import sparse
+
+from cirl_marl.network import Floats, Integers
+from cirl_marl.network.declarations import positional_record
+from cirl_marl.optimum.program import Program
+from cirl_marl.optimum.solver import Basis, Solution
+
+DISTANCE = 0.1
+"""What is charged for stocks at the end of a window that are not those of the plan of the episode, of their price."""
+
+
+@positional_record
+class Correction:
+    """What became of a plan in the simulator, by interval."""
+
+    error: Annotated[Floats, "(q̂ − q)/l of each service, shape (intervals, services)"]
+    rate: Annotated[Floats, "flow over what drives it, planned, shape (intervals, arcs), 1/time"]
+    valve: Annotated[Floats, "planned valve of each node, shape (intervals, nodes)"]
+
+    def of(self, places: Integers) -> Correction:
+        """Return that of other intervals, of which each is taken to be like one of these."""
+        return Correction(self.error[places], self.rate[places], self.valve[places])
+
+
+@positional_record
+class Continuation:
+    """What comes after a window, as a plan of the whole episode had it."""
+
+    costs: Annotated[Floats, "that later rows charge for the variables of the window, shape (intervals, variables)"]
+    stocks: Annotated[Floats, "at the end of the window, shape (stores,), mass"]
+
+
+@positional_record
+class WindowTask:
+    """What is to be planned."""
+
+    stock: Annotated[Floats, "at the start, by stage as the simulator has it, shape (rows,), mass"]
+    intervals: Annotated[range, "of the episode"]
+    demand: Annotated[Floats | None, "mean level of each service over these, shape (services,); None for none"]
+    later: Annotated[Continuation | None, "what comes after; None at the end of the episode"]
+    price: Annotated[Floats, "of a unit of each service that the episode lacks, in the objective, shape (services,)"]
+    correction: Annotated[Correction | None, "of a plan before; None: controls may vary within an interval"]
+    is_outlook: Annotated[bool, "whether the multipliers must be good, as they are the prices of later plans"] = False
+
+
+@positional_record
+class WindowPlan:
+    """A plan of a window, which exists in the simulator."""
+
+    task: Annotated[WindowTask, "what was planned, at the price that was needed"]
+    problem: Annotated[Program, "the program"]
+    solution: Annotated[Solution, "its optimum"]
+    actions: Annotated[Floats, "normalised, shape (intervals, entries)"]
+    correction: Annotated[Correction, "what became of it"]
+    levels: Annotated[Floats, "that the program promises, shape (intervals, services)"]
+    merit: Annotated[float, "objective reached there, less what is left to later intervals and what service lacks"]
+
+    def basis(self, intervals: range) -> Basis | None:
+        """Return the basis from which to plan ``intervals``; None if they are neither as many nor the last of these."""
+        own, basis = self.task.intervals, self.solution.basis
+        if basis is None or len(intervals) == len(own):
+            return basis
+        if intervals.stop != own.stop or intervals.start < own.start:
+            return None
+        return basis.without_first(self.problem, intervals.start - own.start)
+
+    def corrections(self, intervals: range) -> Correction:
+        """Return what is expected of other ``intervals``: what became of these, the last of them from there on."""
+        own = self.task.intervals
+        return self.correction.of(np.clip(np.arange(intervals.start, intervals.stop) - own.start, 0, len(own) - 1))
+
+    def continuation(self, intervals: range) -> Continuation:
+        """Return what comes after some of the intervals, as planned here.
+
+        Its costs are the terms of c − Aᵀy − Gᵀμ that belong to rows of later intervals: a price on each stock at the
+        end and, where products have a lifetime, on what goes into use, which is discarded later.
+        """
+        problem, certificate, layout = self.problem, self.solution.certificate, self.problem.layout
+        first, stop = (end - self.task.intervals.start for end in (intervals.start, intervals.stop))
+        own = slice(first * layout.size, stop * layout.size)
+        costs = np.zeros(own.stop - own.start)
+        for matrix, multipliers in ((problem.equal, certificate.equal), (problem.under, certificate.under)):
+            later = problem.interval_of_rows(matrix) >= stop
+            costs -= matrix[later][:, own].T @ multipliers[later]
+        ends = self.solution.plan[(stop - 1) * layout.size : stop * layout.size][layout.last]
+        return Continuation(costs.reshape(len(intervals), layout.size), np.maximum(ends, 0.0))
+
+
+def level_columns(problem: Program) -> Integers:
+    """Return the variable of each level, shape (intervals · services,)."""
+    layout = problem.layout
+    first = np.arange(len(problem.cost) // layout.size)[:, None] * layout.size
+    columns: Integers = (first + np.arange(layout.level, layout.imbalance)).ravel()
+    return columns
+
+
+def level_rows(problem: Program) -> Integers:
+    """Return the row of G that holds each level, shape (intervals · services,)."""
+    matrix = problem.under.tocsc()[:, level_columns(problem)]
+    matrix.sort_indices()
+    rows: Integers = matrix.indices[matrix.indptr[:-1]]  # that of the demand comes last
+    return rows
+
+
+def with_distance(problem: Program, later: Continuation) -> Program:
+    """Return the program in which stocks at the end cost DISTANCE of their price for what parts them from the plan's.
+
+    Its two new variables for each are what they have more, and less.
+    """
+    layout, stores, rows = problem.layout, len(later.stocks), len(problem.equal_to)
+    last = np.arange(layout.last.start, layout.last.stop) + len(problem.cost) - layout.size
+    ends = sparse.csr_array((np.ones(stores), (np.arange(stores), last)), shape=(stores, len(problem.cost)))
+    parts = sparse.hstack([-sparse.eye_array(stores), sparse.eye_array(stores)])
+    price = DISTANCE * np.abs(later.costs[-1, layout.last])
+    return replace(
+        problem,
+        cost=np.concatenate([problem.cost, price, price]),
+        equal=sparse.block_array([[problem.equal, sparse.csr_array((rows, 2 * stores))], [ends, parts]], format="csr"),
+        equal_to=np.append(problem.equal_to, later.stocks),
+        under=sparse.hstack([problem.under, sparse.csr_array((len(problem.under_to), 2 * stores))], format="csr"),
+        low=np.append(problem.low, np.zeros(2 * stores)),
+        high=np.concatenate([problem.high, problem.high[last], later.stocks]),
+    )
+
+
+def with_lack(problem: Program) -> Program:
+    """Return the program in which the mean level of each service may lack of what is demanded, one variable each."""
+    rows, services = len(problem.under_to), len(problem.layout.network.services)
+    lack = sparse.csr_array(
+        (np.full(services, -1.0), (np.arange(rows - services, rows), np.arange(services))), shape=(rows, services)
+    )
+    empty = sparse.csr_array((len(problem.equal_to), services))
+    most = np.maximum(-problem.under_to[rows - services :], 0.0)
+    return replace(
+        problem,
+        cost=np.append(problem.cost, np.zeros(services)),
+        equal=sparse.hstack([problem.equal, empty], format="csr"),
+        under=sparse.hstack([problem.under, lack], format="csr"),
+        low=np.append(problem.low, np.zeros(services)),
+        high=np.append(problem.high, most + 1.0),  # levels are at least −1
+    )
