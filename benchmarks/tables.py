@@ -23,7 +23,7 @@ from cirl_marl.importing.flow_table import read_flows
 
 LIMIT = 5.0
 """Largest ratio of the small file."""
-SIZES = {4: (25, 5)}
+SIZES = {4: (25, 9), 131: (800, 1)}
 """Regions, and how often a file is read, by its megabytes."""
 
 

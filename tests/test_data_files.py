@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
+import io
 import json
 import os
+import random
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +15,7 @@ from pathlib import Path
 import pytest
 from series_definition import CSV, column, definition, written
 
-from cirl_marl import DefinitionError, RunError, Series, load_network
+from cirl_marl import CirlError, DefinitionError, RunError, Series, load_network
 from cirl_marl.definitions import data_files
 from cirl_marl.definitions.reader import Definition
 from cirl_marl.evaluation.figures import provenance
@@ -336,3 +339,22 @@ def test_files_that_are_too_large_are_refused(tmp_path: Path) -> None:
         file.truncate(300_000_000)
     with pytest.raises(DefinitionError, match=r"file 'ores\.csv': is larger than 200 MB"):
         load_network(path)
+
+
+def test_lines_and_cells_are_those_of_csv(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With quotes and without, with breaks of every kind, across the ends of blocks."""
+    monkeypatch.setattr(data_files, "BLOCK", 3)
+    monkeypatch.setattr(data_files, "CHARACTERS", 5)
+    draw = random.Random(0)
+    for signs in ("a,\n", "a,\r\n", 'aé,"\r\n'):
+        for _ in range(300):
+            text = "".join(draw.choice(signs) for _ in range(draw.randrange(40)))
+            reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+            try:
+                expected = [(reader.line_num, row) for row in reader if row]
+            except csv.Error:
+                with pytest.raises(CirlError, match="is no CSV file"):
+                    list(data_files.csv_blocks("x", text.encode()))
+                continue
+            blocks = data_files.csv_blocks("x", text.encode())
+            assert [line for block in blocks for line in zip(*block, strict=True)] == expected, repr(text)

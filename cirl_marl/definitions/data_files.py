@@ -26,6 +26,8 @@ Block = tuple[Sequence[int], list[list[str]]]
 """Rows of a table, with the numbers of the lines on which they end."""
 BLOCK = 2048
 """Rows of a block."""
+CHARACTERS = 2**16
+"""Characters of a block, up to the end of a line."""
 BREAK = re.compile("\r\n?|\n")
 """What ends a line, inside of a cell too."""
 YEAR = "year"
@@ -55,21 +57,36 @@ def no_collection() -> Iterator[None]:
 
 def csv_blocks(subject: str, content: bytes) -> Iterator[Block]:
     """Yield the rows of a CSV file that are not empty, some thousands at a time; a ``CirlError`` if it is none."""
-    reader = csv.reader(io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline=""), strict=True)
-    line = 0
     try:
-        while rows := list(itertools.islice(reader, BLOCK)):
-            lines: Sequence[int] = range(line + 1, reader.line_num + 1)
-            line = reader.line_num
-            if len(lines) > len(rows):
-                ends = itertools.accumulate(1 + sum(len(BREAK.findall(cell)) for cell in row) for row in rows)
-                lines = [lines[end - 1] for end in ends]
+        for lines, rows in _quoted_blocks(content) if b'"' in content else _plain_blocks(content):
             if [] in rows:
                 lines = [number for number, row in zip(lines, rows, strict=True) if row]
                 rows = [row for row in rows if row]
             yield lines, rows
     except (UnicodeDecodeError, csv.Error) as error:
         raise CirlError(f"{subject}: is no CSV file in UTF-8: {error}") from error
+
+
+def _plain_blocks(content: bytes) -> Iterator[Block]:
+    """Yield the rows of a file without quotes, in which every comma separates cells and every line is a row."""
+    stream, line = io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig"), 1
+    while text := stream.read(CHARACTERS):
+        texts = (text + stream.readline()).removesuffix("\n").split("\n")
+        yield range(line, line + len(texts)), [row.split(",") if row else [] for row in texts]
+        line += len(texts)
+
+
+def _quoted_blocks(content: bytes) -> Iterator[Block]:
+    """Yield the rows of a file with quotes, in which cells may have commas and end lines."""
+    reader = csv.reader(io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline=""), strict=True)
+    line = 0
+    while rows := list(itertools.islice(reader, BLOCK)):
+        lines: Sequence[int] = range(line + 1, reader.line_num + 1)
+        line = reader.line_num
+        if len(lines) > len(rows):
+            ends = itertools.accumulate(1 + sum(len(BREAK.findall(cell)) for cell in row) for row in rows)
+            lines = [lines[end - 1] for end in ends]
+        yield lines, rows
 
 
 def csv_rows(subject: str, content: bytes) -> Block:
