@@ -187,7 +187,7 @@ def test_the_experience_of_another_learner_is_refused(tmp_path: Path, ctrl_c_aft
     kept = [RunDirectory(tmp_path / name).checkpoint for name in "ab"]
     for kind in ("json", "safetensors"):
         (kept[0] / f"use.state.{kind}").replace(kept[1] / f"use.state.{kind}")
-    with pytest.raises(LearnerError, match=r"use\.state\.json: cannot be read"):
+    with pytest.raises(RunError, match=r"use\.state\.json: cannot be read"):
         resume(tmp_path / "b")
 
 

@@ -81,7 +81,7 @@ def test_scenarios_are_built_when_asked_for(tmp_path: Path) -> None:
     path = tmp_path / "copper.toml"
     path.write_text(text.replace('law = "recipient"', 'law = "receiver"'), encoding="utf-8")
     usual = load_network(path)
-    assert list(usual.scenarios) == ["paper"]
+    assert list(usual.scenarios) == ["paper", "outages"]
     said = r"copper.toml: scenarios.paper.arcs.mine_to_refinery.law: unknown value 'receiver'"
     with pytest.raises(DefinitionError, match=said):
         usual.scenario("paper")

@@ -12,6 +12,7 @@ from small_networks import PLAYED
 from cirl_marl import Arc, CirlError, ControlError, MultiAgentVectorEnv, Network, Node, Role, load_network
 from cirl_marl.controllers import Neutral, Random
 from cirl_marl.controllers.rollout import EVALUATION_SEEDS, rollout
+from cirl_marl.network.uncertainty import expected_network
 from cirl_marl.optimum import Incumbent, Plan, bound, search, search_each, standard_candidates
 from cirl_marl.optimum.cross_entropy import SHORTFALL_PRICE, Gaussians, knot_counts
 from cirl_marl.optimum.mpc import Optimum
@@ -25,7 +26,8 @@ EVERYWHERE = PLAYED
 def test_plan_achieves_what_it_says_and_no_less_than_its_candidates(name: str, scenario: str | None) -> None:
     """In each network a lone copy that replays the plan earns the figures that it was chosen for."""
     found = search(name, scenario=scenario, horizon=6, service_weight=1.0, knots=2, population=8, iterations=2)
-    env = MultiAgentVectorEnv(name, scenario=scenario, num_envs=1, horizon=6)
+    network = load_network(name, scenario=scenario).with_options(episode={"horizon": 6})
+    env = MultiAgentVectorEnv(expected_network(network), num_envs=1)
     run = rollout(env, Plan(found))
     assert run.episode_circularity[0] == pytest.approx(found.circularity, rel=1e-12)
     assert run.episode_service[0] == pytest.approx(found.service, rel=1e-12)

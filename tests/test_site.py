@@ -296,7 +296,8 @@ def test_the_site_builds(tmp_path: Path) -> None:
     done = built(ROOT, tmp_path / "site")
     assert done.returncode == 0, done.stderr[-3000:]
     for place, names in (("networks", cirl_marl.networks()), ("recipes", cirl_marl.recipes()), ("models", models())):
-        assert {path.stem for path in (tmp_path / "site" / place).glob("*.html")} == set(names)
+        pages = {path.stem for path in (tmp_path / "site" / place).glob("*.html")}
+        assert {page for page in pages if not page.endswith("_flows")} == set(names)  # and diagrams of large networks
     for path in some(list((tmp_path / "site").rglob("*.html"))):
         text = path.read_text(encoding="utf-8")
         loaded = re.findall(r'<(?:script|img|link|iframe|source)\b[^>]*?(?:src|href)="([^"]*)"', text)

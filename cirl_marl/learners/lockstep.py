@@ -225,9 +225,17 @@ class NetworkWorld(World):
         return {"state": state, "streams": list(now.streams), "joint_steps": self.joint_steps, **progress}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Resume from the state of a world of the same environment; the learners load their last step themselves."""
-        streams = tuple(state["streams"])
-        self.env.restore(Snapshot(State(**state["state"]), streams, self.env.agents, self.env.network))
+        """Resume from the state of a world of the same environment; the learners load their last step themselves.
+
+        Raises:
+            RunError: if it holds something else than the arrays of this environment.
+        """
+        streams, physical = tuple(state["streams"]), State(**state["state"])
+        for part in fields(State):
+            value, now = getattr(physical, part.name), getattr(self.env.physical, part.name)
+            if not isinstance(value, np.ndarray) or (value.dtype, value.shape) != (now.dtype, now.shape):
+                raise RunError(f"the state of the environment: {part.name} is not {now.dtype}, shape {now.shape}")
+        self.env.restore(Snapshot(physical, streams, self.env.agents, self.env.network))
         self.env.circularity_weight = state["weight"]
         self.joint_steps, self._returns, self._lengths = state["joint_steps"], state["returns"], state["lengths"]
 

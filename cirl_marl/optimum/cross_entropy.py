@@ -30,6 +30,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import frozen_record
+from cirl_marl.network.uncertainty import expected_network
 from cirl_marl.optimum.options import DEGREE, check_options, demanded_levels
 from cirl_marl.optimum.planned_episodes import Episodes, Population, by_state_name, starting_states
 
@@ -92,6 +93,8 @@ def search(
     progress: SearchReport = lambda share, objective: None,
 ) -> Incumbent:
     """Look for the actions that do best over one episode, for any network; nothing is proved about the result.
+
+    Of a network that is disturbed they are those that do best where everything is as it is expected to be.
 
     The objective of an episode is λ̄/circularity_scale; with ``service_weight`` w, λ̄/circularity_scale + w·(mean service
     level); with ``min_service`` s, λ̄/circularity_scale − SHORTFALL_PRICE·Σ max(0, s − mean level), over the services: a
@@ -165,6 +168,7 @@ def search_each(
             raise CirlError(f"{name} must be a whole number of at least {least}, got {value!r}")
     if knots > network.episode.horizon:
         raise CirlError(f"knots: {knots} are more than the {network.episode.horizon} decisions of an episode")
+    network = expected_network(network)
     demand = np.zeros(0) if min_service is None else demanded_levels(network, min_service)
     starts = np.asarray(initial, dtype=float)
     copies = Population(network, agents, starts, population)

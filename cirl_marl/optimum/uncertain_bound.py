@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import pickle
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import field
+from dataclasses import field, fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,6 +14,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from cirl_marl.controllers.rollout import SEED_SPACING, first_seed
+from cirl_marl.definitions.writer import fingerprint
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.jobs import JobStatus, Tell, check_place, raise_first, run_jobs
@@ -268,8 +268,7 @@ def prove_draws(
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) if sampling.directory is None else sampling.directory
         first = first_seed(sampling.seed)
-        content = (network, agents, initial, degree, sampling.numbers, prices)
-        digest = hashlib.sha256(pickle.dumps(content)).hexdigest()[:16]
+        digest = _digest(network, agents, initial, degree, sampling.numbers, prices)
         jobs = [
             ProofJob(
                 name=f"draws-{digest}-{first + begin}-{min(CHUNK, sampling.draws - begin)}",
@@ -300,6 +299,22 @@ def prove_draws(
     if len(proofs.values) != sampling.draws or np.isnan(proofs.values).any():
         raise CirlError(f"{len(proofs.values)} of {sampling.draws} draws have a bound; every one counts")
     return proofs
+
+
+def _digest(
+    network: Network,
+    agents: Sequence[str],
+    initial: Floats | None,
+    degree: int,
+    numbers: bool,
+    prices: Sequence[Prices],
+) -> str:
+    """Return what tells proofs of one question from those of another."""
+    hashed = hashlib.sha256(repr((fingerprint(network), tuple(agents), degree, numbers)).encode())
+    arrays = [getattr(price, part.name) for price in prices for part in fields(price)]
+    for array in [np.zeros(0) if initial is None else initial, *arrays]:
+        hashed.update(repr(np.shape(array)).encode() + np.ascontiguousarray(array, dtype=float).tobytes())
+    return hashed.hexdigest()[:16]
 
 
 @frozen_record
