@@ -5,7 +5,7 @@ reward is the circularity λ(N;t) of the network.
 
 >>> import cirl_marl
 >>> cirl_marl.networks()[:3]
-['aluminium_world', 'carbo_net', 'copper_net']
+['aluminium_world', 'car_batteries', 'carbo_net']
 
 Every name here is loaded when it is first asked for (PEP 562), so that importing the library is cheap.
 """

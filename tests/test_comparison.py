@@ -116,7 +116,7 @@ def test_plans_tell_how_far_they_are(bottles: Network, monkeypatch: pytest.Monke
     everyone = ["neutral", "optimum", "mpc"]
     told = reported(lambda progress: compare([], everyone, network=bottles, episodes=2, progress=progress))
     seen = {what: len({share for each, share in told if each == what}) for what in [*everyone, "bounds"]}
-    assert seen["neutral"] == 1 + 14 and seen["mpc"] == 1 + 2 + 14 and seen["bounds"] >= 3 * 2 + 3
+    assert seen["neutral"] == 1 + 14 and seen["mpc"] == 1 + 2 + 14 and seen["bounds"] > 3 * 2
     assert seen["optimum"] > 2 * (1 + 1) + 14  # the bound and some rounds of improvement for both episodes
 
 
