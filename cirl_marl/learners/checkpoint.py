@@ -208,6 +208,8 @@ def set_normaliser_state(env: VecNormalize, state: Mapping[str, Any], *, returns
         mean, var = _array(moments["mean"]), _array(moments["var"])
         if np.shape(statistics.mean) != mean.shape:
             raise RunError(f"is for {mean.size} entries, not {np.size(statistics.mean)}")
+        if var.shape != mean.shape or not (np.isfinite(mean) & np.isfinite(var) & (var >= 0)).all():
+            raise RunError("has moments that are none: means and variances must be finite, variances not negative")
         statistics.mean, statistics.var, statistics.count = mean, var, moments["count"]
     if returns:
         env.returns = _array(state["returns"])
