@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from cirl_marl.definitions.catalogue import networks as networks
     from cirl_marl.definitions.catalogue import recipes as recipes
     from cirl_marl.definitions.reader import write_network as write_network
+    from cirl_marl.environments.derivatives import gradient as gradient
     from cirl_marl.environments.goal import GoalEnv as GoalEnv
     from cirl_marl.environments.joint import JointEnv as JointEnv
     from cirl_marl.environments.joint import JointVectorEnv as JointVectorEnv
@@ -114,6 +115,7 @@ _MODULES = {
     "controllers.scripted": "ScriptController",
     "definitions.catalogue": "load_network networks recipes",
     "definitions.reader": "write_network",
+    "environments.derivatives": "gradient",
     "environments.goal": "GoalEnv",
     "environments.joint": "JointEnv JointVectorEnv",
     "environments.parallel": "NetworkParallelEnv aec_env parallel_env vector_env",

@@ -39,7 +39,7 @@ def test_neutral_at_a_bound_is_an_action(low: float, high: float, where: str) ->
     assert (abs(action) <= 1.0).all()
     assert np.isfinite(rollout(env, Neutral(), seed=0).circularity).all()
     first = np.zeros(2, dtype=np.intp)
-    rates = [env.dynamics.rate(env._actuators.controls(np.full((1, 2), end), first))[0, 0] for end in (-1.0, 1.0)]
+    rates = [env.dynamics.rate(env.actuators.controls(np.full((1, 2), end), first))[0, 0] for end in (-1.0, 1.0)]
     assert 0.1 * low <= rates[0] == pytest.approx(0.1 * low)
     assert 0.1 * high >= rates[1] == pytest.approx(0.1 * high)
 

@@ -68,8 +68,8 @@ def played(network: Network, seed: int, *, short: bool = True, kept: Iterable[in
         with keeping(kept):
             env = MultiAgentVectorEnv(network, num_envs=2)
     if not short:
-        assert env.dynamics._taylor is not None
-        env.dynamics._taylor._shortcut = None
+        assert env.dynamics.taylor is not None
+        env.dynamics.taylor._shortcut = None
     env.reset(seed=seed)
     rng = np.random.default_rng(seed)
     found = []

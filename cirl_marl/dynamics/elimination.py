@@ -52,6 +52,7 @@ class _Round:
     detours: Annotated[RowSum, "adds the detours to the entries of the shares that they make up"]
     forward: Annotated[RowSum, "adds what ``out`` carries to the nodes that get it"]
     donors: Annotated[Integers, "node that gives each of ``out``"]
+    recipients: Annotated[Integers, "node that gets each of them"]
     backward: Annotated[RowSum, "adds what ``into`` carries to ``nodes``"]
     sources: Annotated[Integers, "node that gives each of ``into``"]
 
@@ -166,6 +167,17 @@ class EliminationOrder:
         back = self.nodes - 1
         return nodes, Triangle(out, givers, self.nodes), Triangle(back - getters, back - into, self.nodes)
 
+    @cached_property
+    def transposed_rounds(self) -> list[tuple[RowSum, RowSum]]:
+        """``forward`` and ``backward`` of each round the other way, from those that get to those that give."""
+        return [
+            (
+                RowSum(round_.donors, np.arange(len(round_.out)), 1.0, (self.nodes, len(round_.out))),
+                RowSum(round_.sources, np.arange(len(round_.into)), 1.0, (self.nodes, len(round_.into))),
+            )
+            for round_ in self.rounds
+        ]
+
     def _round_of(self, nodes: Integers, out_ways: _Ways, into_ways: _Ways) -> _Round:
         (out_counts, out), (into_counts, into) = out_ways, into_ways
         giver, getter = np.repeat(np.arange(len(nodes)), out_counts), np.repeat(np.arange(len(nodes)), into_counts)
@@ -191,6 +203,7 @@ class EliminationOrder:
             detours=RowSum(entries, np.arange(len(entries)), 1.0, (self.size, len(entries))),
             forward=RowSum(out, np.arange(len(out)), 1.0, (self.nodes, len(out))),
             donors=nodes[giver],
+            recipients=out,
             backward=RowSum(nodes[getter], np.arange(len(into)), 1.0, (self.nodes, len(into))),
             sources=into,
         )
@@ -289,3 +302,18 @@ class EliminatedShares:
         for round_, _, into in reversed(self._steps):
             round_.backward.add_to(inflow, inflow.take(round_.sources, 0) * into)
         return inflow
+
+    def worth(self, values: Floats) -> Floats:
+        """Return, in place of the worth of what passes through each node, that of what enters it, shape (nodes, B).
+
+        It is (I − P)⁻¹ w, the transpose of ``throughput``: the same factors in the opposite order.
+        """
+        core, transposed_rounds = self._order.core, self._order.transposed_rounds
+        for (round_, _, into), (_, backward) in zip(self._steps, transposed_rounds, strict=True):
+            backward.add_to(values, values.take(round_.nodes[round_.getter], 0) * into)
+        values *= self._inverse
+        if len(core):
+            values[core] = (self._visits @ np.ascontiguousarray(values[core].T)[..., None])[..., 0].T
+        for (round_, out, _), (forward, _) in zip(reversed(self._steps), reversed(transposed_rounds), strict=True):
+            forward.add_to(values, values.take(round_.recipients, 0) * out)
+        return values

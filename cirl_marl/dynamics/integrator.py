@@ -12,6 +12,7 @@ from cirl_marl.dynamics.batches import BatchTransport
 from cirl_marl.dynamics.inner_physics import InnerPhysics
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.dynamics.routing import IntervalRoutes
+from cirl_marl.dynamics.scheduled_flows import ScheduledFlows
 from cirl_marl.dynamics.stages import FixedLifetimes, StagedNetwork
 from cirl_marl.dynamics.taylor import Taylor
 from cirl_marl.errors import CirlError
@@ -53,6 +54,8 @@ class Dynamics(FlowLaws):
         batches: the batch arcs.
         physical: whether stocks are kept non-negative.
         substeps: solver steps per control interval.
+        taylor: the exact solver, if it is that.
+        scheduled: cuts what asks for more than there is.
         terms: terms of the series of the exact solver.
     """
 
@@ -66,28 +69,15 @@ class Dynamics(FlowLaws):
         self.physical = episode.solver != "euler"
         self.substeps = self.solver_steps()
         self.substep = episode.control_interval / self.substeps
-        self._taylor = Taylor(self, self.substep) if episode.solver == "exact" else None
-        self.terms = self._taylor.terms if self._taylor is not None else 0
+        self.taylor = Taylor(self, self.substep) if episode.solver == "exact" else None
+        self.terms = self.taylor.terms if self.taylor is not None else 0
+        self.scheduled = ScheduledFlows(self.staged_network, self.is_scheduled, self.driver, self.substep)
         shape = (rows.masses, len(network.arcs))
         self._outflow_sum = RowSum(rows.donors, np.arange(shape[1]), 1.0, shape)
         self._busiest = int(np.bincount(network.donors, minlength=1).max())
         laws = {arc.law for arc in network.arcs}
         self._heedless = self.physical and bool(laws & {Law.RECIPIENT, Law.COMPARTMENT})
         self._needs_step = (*self.time_dependent, *(arc.id for arc in network.arcs if arc.law is Law.BATCH))
-        self._compile_orders()
-
-    def _compile_orders(self) -> None:
-        """Find the donors of scheduled flows, and their outflows by schedule and in proportion to their stock."""
-        network = self.staged_network
-        self._order_arcs: Integers = np.flatnonzero(self.is_scheduled)
-        self._order_donors, order_slot = np.unique(network.donors[self._order_arcs], return_inverse=True)
-        self._order_slot: Integers = order_slot
-        slot = {int(node): i for i, node in enumerate(self._order_donors)}
-        proportional = self.driver == network.donors
-        exits = [k for k, d in enumerate(network.donors) if int(d) in slot and proportional[k]]
-        exit_slot = [len(slot) + slot[int(network.donors[k])] for k in exits]
-        rows, columns = [*order_slot, *exit_slot], [*self._order_arcs, *exits]
-        self._orders_and_exits = RowSum(rows, columns, 1.0, (2 * len(slot), len(network.arcs)))
 
     def advance(
         self,
@@ -125,10 +115,10 @@ class Dynamics(FlowLaws):
         inner = self.inner.tick(inner, controls, stock)
         total = None
         for _ in range(self.substeps):
-            actual_rate = self._limit_orders(stock, rate) if self.physical else rate
-            if self._taylor is not None:
+            actual_rate = self.scheduled.cut(stock, rate) if self.physical else rate
+            if self.taylor is not None:
                 stock, transfer, actual_rate = self._settle(
-                    stock, actual_rate, partial(self._taylor.moved_mass, stock, routes, terms)
+                    stock, actual_rate, partial(self.taylor.moved_mass, stock, routes, terms)
                 )
             else:
                 stock, inner, transfer, actual_rate = self._explicit_step(stock, inner, actual_rate, routes, controls)
@@ -163,7 +153,7 @@ class Dynamics(FlowLaws):
             stock = self.slots.shift_slots(stock)
             self.slots.set_outflows(stock, rate)
         if self.physical:
-            rate = self._limit_orders(stock, rate)
+            rate = self.scheduled.cut(stock, rate)
         routes = self.routing.routes(rate)
         flow, arcs = self._flow_at(stock, inner, controls, rate, routes), len(self.network.arcs)
         if not self._heedless:
@@ -179,8 +169,8 @@ class Dynamics(FlowLaws):
     def _flow_at(
         self, stock: Floats, inner: Floats, controls: Floats, rate: Floats, routes: IntervalRoutes | None
     ) -> Floats:
-        if self._taylor is not None:
-            return self._taylor.flow(stock, routes, rate)
+        if self.taylor is not None:
+            return self.taylor.flow(stock, routes, rate)
         return self._forward(self.flow(self.inner.extend(stock, inner, controls), rate), routes)
 
     def _forward(self, flow: Floats, routes: IntervalRoutes | None) -> Floats:
@@ -222,29 +212,6 @@ class Dynamics(FlowLaws):
             moved_mass = transfer(rate)
             after = self.incidence.add_to(stock.copy(), moved_mass)
         return after, self.inner.after_change(ahead, change), moved_mass, rate
-
-    def _limit_orders(self, stock: Floats, rate: Floats) -> Floats:
-        """Cut scheduled flows so that no donor is overdrawn.
-
-        A donor with stock x, proportional exits a and a constant outflow U obeys ẋ ≥ −a·x − U, which stays
-        non-negative for a substep h if U ≤ x·a/(e^{ah} − 1). Flows from one donor are cut by the same factor.
-        """
-        if not len(self._order_arcs):
-            return rate
-        outflows = self._orders_and_exits(rate)
-        outflows *= self.substep
-        demand, turned_over = outflows[: len(self._order_donors)], outflows[len(self._order_donors) :]
-        available_stock = stock.take(self._order_donors, axis=0)
-        if (demand <= available_stock * (1.0 - turned_over) * (1.0 - 1e-12)).all():
-            return rate  # x·a/(e^{ah} − 1) ≥ x(1 − ah)/h: nothing can be overdrawn
-        share = np.divide(
-            turned_over, np.expm1(turned_over), out=np.ones_like(available_stock), where=turned_over > 1e-12
-        )
-        available = available_stock * share * (1.0 - 1e-12)
-        factor = np.divide(available, demand, out=np.ones_like(available_stock), where=demand > available)
-        rate = rate.copy()
-        rate[self._order_arcs] *= factor.take(self._order_slot, axis=0)
-        return rate
 
     def _settle(self, stock: Floats, rate: Floats, transfer: Transfer) -> tuple[Floats, Floats, Floats]:
         """Move mass; where a flow that does not heed its donor asked for more than that held, send what was there.

@@ -113,7 +113,7 @@ class ArcRates:
         if draws is not None:
             least, widest = draws.controls.extreme(least, 0), draws.controls.extreme(widest, 1)
             widest[draws.capacity.rows] *= draws.highest_capacity
-        widest[self._stretch_rows] = least[self._stretch_rows]
+        widest[self.stretch_rows] = least[self.stretch_rows]
         self.max_rate: Floats = self._rate_without_shares(widest)[:, 0]
         if len(self._series_arcs):
             self.max_rate[self._series_arcs] *= self._series.max(axis=1)
@@ -160,25 +160,31 @@ class ArcRates:
             return max(stated, math.ceil(fastest * episode.control_interval / MAX_TURNOVER - 1e-9))
         return stated
 
+    def control_multipliers(self, controls: Floats) -> Floats:
+        """Return by what controls multiply the rates of arcs: a stretch by its inverse."""
+        if not len(self.stretch_rows):
+            return controls
+        controls = controls.copy()
+        controls[self.stretch_rows] = 1.0 / controls[self.stretch_rows]
+        return controls
+
     def _rate_without_shares(self, controls: Floats) -> Floats:
         """Return r, but for shares and time series."""
-        if len(self._stretch_rows):
-            controls = controls.copy()
-            controls[self._stretch_rows] = 1.0 / controls[self._stretch_rows]
+        controls = self.control_multipliers(controls)
         if self._partial:  # some arc lacks a control: let a row of ones stand in for it
             controls = np.concatenate([controls, np.ones((1, controls.shape[1]))])
-        own_row, base, donor = self._own_control, self._base, self._donor_control
-        if sparse := 2 * len(self._controlled_arcs) < len(base):
+        own_row, base, donor = self.own_control, self._base, self.donor_control
+        if sparse := 2 * len(self.controlled_arcs) < len(base):
             rate = np.empty((len(base), controls.shape[1]))
             rate[...] = base
-            own_row, donor = own_row[self._controlled_arcs], donor[self._controlled_arcs]
-            base = base[self._controlled_arcs]
+            own_row, donor = own_row[self.controlled_arcs], donor[self.controlled_arcs]
+            base = base[self.controlled_arcs]
         rate_: Floats = controls.take(own_row, axis=0)
         rate_ *= base
         rate_ *= controls.take(donor, axis=0)
         if not sparse:
             return rate_
-        rate[self._controlled_arcs] = rate_
+        rate[self.controlled_arcs] = rate_
         return rate
 
     def _compile_controls(self) -> None:
@@ -187,7 +193,7 @@ class ArcRates:
         kinds = {c.id: c.control.kind for c in network.compartments.values() if c.control is not None}
         position = {id_: network.control_rows[id_].start for id_, kind in kinds.items() if kind in SCALING}
         stretch_rows = [position[id_] for id_, kind in kinds.items() if kind is ControlKind.STRETCH]
-        self._stretch_rows: Integers = np.array(stretch_rows, dtype=np.intp)
+        self.stretch_rows: Integers = np.array(stretch_rows, dtype=np.intp)
         self.control_low, self.neutral, self.control_high = network.control_bounds
         no_row = len(self.neutral)
         valves = network.valves if isinstance(network, StagedNetwork) else {}
@@ -202,9 +208,9 @@ class ArcRates:
             return own_row, valve
 
         rows = np.array([acting_on(arc) for arc in network.arcs], dtype=np.intp).reshape(-1, 2)
-        self._own_control, self._donor_control = rows[:, 0].copy(), rows[:, 1].copy()
+        self.own_control, self.donor_control = rows[:, 0].copy(), rows[:, 1].copy()
         self._partial = bool((rows == no_row).any())
-        self._controlled_arcs: Integers = np.flatnonzero((rows < no_row).any(axis=1))
+        self.controlled_arcs: Integers = np.flatnonzero((rows < no_row).any(axis=1))
 
 
 class FlowLaws(ArcRates):
@@ -225,33 +231,33 @@ class FlowLaws(ArcRates):
         staged_network = simulated_network(network)
         self.factors = IntervalFactors(network, uncertain=uncertain)
         ranges = self.factors.ranges
-        self._factors = FlowFactors(staged_network, ranges) if ranges else None
+        self.flow_factors = FlowFactors(staged_network, ranges) if ranges else None
         self.control_factors = ControlFactors(staged_network, ranges)
-        super().__init__(staged_network, self._factors)
+        super().__init__(staged_network, self.flow_factors)
         self.network, rows, arcs = network, self.rows, len(staged_network.arcs)
         ends = np.concatenate([staged_network.donors, staged_network.recipients])
         has_stock, arcs_twice = ends < rows.nodes.stop, np.tile(np.arange(arcs), 2)
         signs = np.repeat([-1.0, 1.0], arcs)
         self.incidence = RowSum(ends[has_stock], arcs_twice[has_stock], signs[has_stock], (rows.masses, arcs))
-        self._shares = Shares(staged_network, ranges)
-        self.max_rate[self._shares.arcs] *= self._shares.highest
-        time_arcs = [*self._series_arcs, *(self._shares.varying_arcs if self._shares.is_time_varying else ())]
+        self.shares = Shares(staged_network, ranges)
+        self.max_rate[self.shares.arcs] *= self.shares.highest
+        time_arcs = [*self._series_arcs, *(self.shares.varying_arcs if self.shares.is_time_varying else ())]
         self.time_dependent = tuple(staged_network.arcs[k].id for k in time_arcs)
         self._share_out()
         self.routing = Routing(staged_network, self.rate(self.neutral[:, :1]), self.is_fixed, ranges)
 
     def _share_out(self) -> None:
         """Multiply constant shares into r, where no control comes before them, and find out which r never change."""
-        shares = self._shares
+        shares = self.shares
         self.is_fixed = ~self.is_scheduled
-        self.is_fixed[self._controlled_arcs] = False
-        once = ~np.isin(shares.constant_arcs, self._controlled_arcs)
+        self.is_fixed[self.controlled_arcs] = False
+        once = ~np.isin(shares.constant_arcs, self.controlled_arcs)
         self._base[shares.constant_arcs[once]] *= shares.values[once]
         self._constant_shares = shares.constant_arcs[~once], shares.values[~once]
         self.is_fixed[self._series_arcs] = False
         self.is_fixed[shares.varying_arcs] = False
-        if self._factors is not None:
-            self.is_fixed[self._factors.arcs] = False
+        if self.flow_factors is not None:
+            self.is_fixed[self.flow_factors.arcs] = False
 
     def rate(self, controls: Floats, step: Integers | None = None, factors: Floats | None = None) -> Floats:
         """Return r of each arc, shape (arcs, B): 1/time for stock-driven arcs, mass/time for scheduled ones.
@@ -265,25 +271,34 @@ class FlowLaws(ArcRates):
         if len(self._constant_shares[0]):
             arcs, shares = self._constant_shares
             rate[arcs] *= shares
-        if len(self._shares.varying_arcs):
-            rate[self._shares.varying_arcs] *= self._shares(controls, step, factors)
+        if len(self.shares.varying_arcs):
+            rate[self.shares.varying_arcs] *= self.shares(controls, step, factors)
         if step is not None and len(self._series_arcs):
             rate[self._series_arcs] *= self._series[:, step]
-        if factors is not None and self._factors is not None:
-            self._factors.multiply(rate, factors)
+        if factors is not None and self.flow_factors is not None:
+            self.flow_factors.multiply(rate, factors)
+        return rate
+
+    def constant_rate(self, step: Integers) -> Floats:
+        """Return what controls, varying shares and factors multiply in the rates of arcs, shape (arcs, B)."""
+        rate = np.repeat(self._base, len(step), axis=1)
+        arcs, shares = self._constant_shares
+        rate[arcs] *= shares
+        if len(self._series_arcs):
+            rate[self._series_arcs] *= self._series[:, step]
         return rate
 
     def neutral_in(self, step: Integers, factors: Floats | None = None) -> Floats:
         """Return the controls while nobody acts, in one interval of each copy, shape (controls, B)."""
         neutral = self.control_factors(_in_interval(self.neutral, step), factors)
-        if factors is None or self._factors is None or not len(self._factors.capacity.rows):
+        if factors is None or self.flow_factors is None or not len(self.flow_factors.capacity.rows):
             return neutral
         return np.minimum(neutral, self.capacity_in(step, factors))
 
     def capacity_in(self, step: Integers, factors: Floats | None) -> Floats:
         """Return the upper bounds of the controls, likewise."""
         bounds = self.control_factors(_in_interval(self.control_high, step), factors)
-        return bounds if self._factors is None else self._factors.capacity(bounds, factors)
+        return bounds if self.flow_factors is None else self.flow_factors.capacity(bounds, factors)
 
     def flow(self, stock: Floats, rate: Floats) -> Floats:
         """Return the flows f = r ∘ y[driver], shape (arcs, B), mass/time; ``routing`` fills in what is passed on."""

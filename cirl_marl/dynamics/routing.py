@@ -12,6 +12,7 @@ arcs and of the detours through constant nodes.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Annotated
 
 import numpy as np
@@ -163,6 +164,31 @@ class Routing:
         self._among.substitute(through)
         np.multiply(through[early][::-1], self._inverse, out=result[early])
         return self._back.substitute(result)
+
+    @cached_property
+    def _transposes(self) -> tuple[RowSum, RowSum, RowSum, RowSum, RowSum]:
+        ahead, among, back = (matrix.transpose(reverse=True) for matrix in (self._ahead, self._among, self._back))
+        on, shape = np.arange(len(self._on)), (self.nodes, len(self._on))
+        return ahead, among, back, self._on_to.transpose(), RowSum(self._on_from + self._early.stop, on, 1.0, shape)
+
+    def worths(self, worth: Floats, routes: IntervalRoutes) -> Floats:
+        """Return what is worth a unit that enters each node, in ``places``, of the worth of what passes through each.
+
+        It is the transpose of ``throughputs``: the worth of throughputs stands in the rows of its result, and is used
+        up. Shapes are (nodes, B).
+        """
+        ahead, among, back, on_to, on_from = self._transposes
+        early, late = self._early, slice(self._early.stop, self.nodes)
+        worth = back.substitute(worth[::-1].copy())[::-1]
+        through = np.zeros_like(worth)
+        through[early] = (worth[early] * self._inverse)[::-1]
+        through = among.substitute(through[::-1].copy())[::-1]
+        if late.start < late.stop:
+            kept_rows = on_from.add_to(worth.copy(), on_to(through.copy()) * routes.rate.take(self._on, 0))
+            kept_rows[early] = 0.0
+            kept_rows[late] = routes.kept_nodes.worth(kept_rows[late])
+            through = through + ahead.substitute(kept_rows[::-1].copy())[::-1]
+        return through
 
     def most(self, flow: Floats) -> Floats:
         """Return upper bounds of the throughputs if flows that enter are at most ``flow``, shape (arcs,).

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -88,16 +89,7 @@ class Shares:
 
     def __call__(self, controls: Floats, step: Integers | None, factors: Floats | None = None) -> Floats:
         """Return the shares of ``varying``, shape (shares, B); arguments are those of ``FlowLaws.rate``."""
-        low, room, proportions = self._low, self._room, self._proportions
-        if self.is_time_varying:
-            # without a step the first interval stands for all
-            interval = np.zeros(1, dtype=np.intp) if step is None else step
-            low, room, proportions = (table.take(interval, axis=1) for table in (low, room, proportions))
-        if factors is not None and self._drawn.is_active:
-            low = self._drawn(low, factors)
-            room = np.maximum(1.0 - self._total(low), 0.0)
-        if factors is not None and self._factors.rows.size:
-            proportions = self._drawn_proportions(step, factors)
+        low, room, proportions = self._tables(step, factors)
         shares = controls.take(self._rows, axis=0)
         shares -= low
         np.maximum(shares, 0.0, out=shares)  # rounding may ask for a little less than the lowest
@@ -109,14 +101,80 @@ class Shares:
         remainder *= proportions
         return np.concatenate([shares, remainder])
 
+    def _tables(self, step: Integers | None, factors: Floats | None) -> tuple[Floats, Floats, Floats]:
+        """Return the least shares, what they leave, and π of the arcs without control."""
+        low, room, proportions = (self._table_in(table, step) for table in (self._low, self._room, self._proportions))
+        if factors is not None and self._drawn.is_active:
+            low = self._drawn(low, factors)
+            room = np.maximum(1.0 - self._total(low), 0.0)
+        if factors is not None and self._factors.rows.size:
+            proportions = self._drawn_proportions(step, factors)
+        return low, room, proportions
+
+    def pull_back(
+        self,
+        controls: Floats,
+        step: Integers,
+        factors: Floats | None,
+        adjoint: Floats,
+        control_adjoint: Floats,
+        factor_adjoint: Floats | None,
+    ) -> None:
+        """Add to the adjoints of controls and factors what that of the shares of ``varying``, (shares, B), brings.
+
+        What asks for just as much as there is counts as getting it.
+        """
+        low, room, proportions = self._tables(step, factors)
+        own, others = np.split(adjoint, [len(self._rows)])
+        excess = controls.take(self._rows, axis=0) - low
+        is_free = excess >= 0
+        excess = np.where(is_free, excess, 0.0)
+        demand = self._total(excess)
+        is_scarce = demand > room
+        part = np.divide(room, demand, out=np.ones_like(demand), where=is_scarce)
+        remainder = 1.0 - self._total(excess * part.take(self._of, 0) + low)
+        # what a share gets more the arcs without control get less
+        own = own - np.where(remainder > 0, self._total_of_others(others * proportions), 0.0).take(self._of, 0)
+        per_room = np.divide(self._total(own * excess), demand, out=np.zeros_like(demand), where=is_scarce)
+        by_excess = (own * part.take(self._of, 0) - (per_room * part).take(self._of, 0)) * is_free
+        np.add.at(control_adjoint, self._rows, by_excess)
+        if factors is None or factor_adjoint is None:
+            return
+        if self._drawn.is_active:
+            by_low = own - by_excess - (per_room * (room > 0)).take(self._of, 0)
+            self._drawn.pull_back(self._table_in(self._low, step), factors, by_low, factor_adjoint)
+        if self._factors.rows.size:
+            by_proportion = others * np.maximum(remainder, 0.0).take(self._of_others, 0)
+            self._pull_back_proportions(step, factors, by_proportion, factor_adjoint)
+
+    def _pull_back_proportions(self, step: Integers, factors: Floats, adjoint: Floats, factor_adjoint: Floats) -> None:
+        """Add to the adjoint of the factors what that of π brings, shape (others, B)."""
+        stated_values, remainder, rest = (
+            self._table_in(table, step) for table in (self._stated_shares, self._remainder, self._rest)
+        )
+        proportions = self._drawn_proportions(step, factors)
+        drawn = self._factors(stated_values, factors)
+        leftover = np.maximum(remainder - self._total_of_others(drawn), 0.0)
+        total = self._total_of_others(np.where(rest, leftover.take(self._of_others, 0), drawn))
+        # π = w/Σw, with w what is left where an arc takes the rest
+        mean = self._total_of_others(adjoint * proportions).take(self._of_others, 0)
+        total = total.take(self._of_others, 0)
+        by_weight = np.divide(adjoint - mean, total, out=np.zeros_like(adjoint), where=total > 0)
+        by_leftover = np.where(leftover > 0, self._total_of_others(np.where(rest, by_weight, 0.0)), 0.0)
+        by_weight = np.where(rest, 0.0, by_weight - by_leftover.take(self._of_others, 0))
+        self._factors.pull_back(stated_values, by_weight, factor_adjoint)
+
+    def _table_in(self, table: Any, step: Integers | None) -> Any:
+        """Return a table of splits in an interval of each copy; without a step the first stands for all."""
+        if not self.is_time_varying:
+            return table
+        return table.take(np.zeros(1, dtype=np.intp) if step is None else step, axis=1)
+
     def _drawn_proportions(self, step: Integers | None, factors: Floats) -> Floats:
         """Return π of the arcs without control, shape (others, B), for what was drawn (``splits.proportions``)."""
-        stated_values, remainder, rest = self._stated_shares, self._remainder, self._rest
-        if self.is_time_varying:
-            interval = np.zeros(1, dtype=np.intp) if step is None else step
-            stated_values, remainder, rest = (
-                table.take(interval, axis=1) for table in (stated_values, remainder, rest)
-            )
+        stated_values, remainder, rest = (
+            self._table_in(table, step) for table in (self._stated_shares, self._remainder, self._rest)
+        )
         weights = self._factors(stated_values, factors)
         leftover = np.maximum(remainder - self._total_of_others(weights), 0.0)
         weights = np.where(rest, leftover.take(self._of_others, 0), weights)

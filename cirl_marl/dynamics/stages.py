@@ -226,3 +226,14 @@ class FixedLifetimes:
     def set_outflows(self, stock: Floats, rate: Floats) -> None:
         """Set the flows of what comes out in the interval, in place; ``rate`` has shape (arcs, B)."""
         rate[self.arcs] = stock[self._old] / self._interval
+
+    def pull_back(self, stock_adjoint: Floats, rate_adjoint: Floats) -> Floats:
+        """Return the adjoint of the masses before ``shift_slots``, of those after it and of what comes out, in place.
+
+        Rates of what comes out follow from the slots alone, so that their adjoint is used up.
+        """
+        stock_adjoint[self._old] += rate_adjoint[self.arcs] / self._interval
+        rate_adjoint[self.arcs] = 0.0
+        before = stock_adjoint.copy()
+        before[self._from] = stock_adjoint[self._to]
+        return before

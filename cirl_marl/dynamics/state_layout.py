@@ -100,6 +100,12 @@ class StateLayout:
         """Return the stock of each node that has one, shape (stores, B), of masses or of their first rows."""
         return masses[self.nodes] if self._totals is None else self._totals(masses[self.nodes])
 
+    def masses_adjoint(self, stocks_adjoint: Floats) -> Floats:
+        """Return derivatives by the masses, shape (masses, B), of those by the ``stocks``: all stages count alike."""
+        masses = np.zeros((self.masses, stocks_adjoint.shape[1]))
+        masses[self.nodes] = stocks_adjoint if self._totals is None else self._totals.transpose()(stocks_adjoint)
+        return masses
+
     def start_of(self, masses: Floats, inner: Floats) -> Floats:
         """Return the rows of ``start_names``, shape (rows, B)."""
         return np.concatenate([masses[self.nodes], inner])

@@ -50,6 +50,16 @@ class Supply:
 
     Attributes:
         arcs: their ids.
+        of: service that each stands for, among those that arcs make up for, shape (arcs,).
+        rows: row of each among the controls.
+        weights: of each, shape (arcs, 1).
+        total: sums over the arcs of each service.
+        demand: D in each interval, shape (services, horizon).
+        demand_factors: factors on it.
+        drawn: factors on the bounds of ``rows``.
+        measure: q of stocks and mean flows.
+        arrivals: A.
+        duration: by which A is multiplied, an interval or 1.
     """
 
     def __init__(self, dynamics: Dynamics) -> None:
@@ -60,18 +70,18 @@ class Supply:
         service_ids = list(dict.fromkeys(arc.makes_up_for for arc in made_up))
         services = [service for service in network.services if service.id in service_ids]
         order = [service.id for service in services]
-        self._of: Integers = np.array([order.index(arc.makes_up_for) for arc in made_up], dtype=np.intp)
-        self._rows: Integers = np.array([network.control_rows[arc.id].start for arc in made_up], dtype=np.intp)
+        self.of: Integers = np.array([order.index(arc.makes_up_for) for arc in made_up], dtype=np.intp)
+        self.rows: Integers = np.array([network.control_rows[arc.id].start for arc in made_up], dtype=np.intp)
         weights = [1.0 if arc.weight is None else arc.weight for arc in made_up]
-        self._weights, self._most_arcs = np.array(weights).reshape(-1, 1), int(np.bincount(self._of).max(initial=0))
-        self._total = RowSum(self._of, np.arange(len(made_up)), 1.0, (len(services), len(made_up)))
+        self.weights, self._most_arcs = np.array(weights).reshape(-1, 1), int(np.bincount(self.of).max(initial=0))
+        self.total = RowSum(self.of, np.arange(len(made_up)), 1.0, (len(services), len(made_up)))
         demand = [network.interval_means(service.low) for service in services]
-        self._demand = np.array(demand).reshape(len(services), network.episode.horizon)
+        self.demand = np.array(demand).reshape(len(services), network.episode.horizon)
         numbers = numbers_of(dynamics.factors.ranges, "services", "low")
-        self._factors = RowFactors(
+        self.demand_factors = RowFactors(
             {row: numbers[service_.id] for row, service_ in enumerate(services) if service_.id in numbers}
         )
-        self._drawn = ControlFactors(network, dynamics.factors.ranges, self._rows)
+        self.drawn = ControlFactors(network, dynamics.factors.ranges, self.rows)
         stores, rows, columns = len(network.stores), [], []
         for row, service in enumerate(services):
             if service.quantity == "stock":
@@ -80,15 +90,20 @@ class Supply:
                 read = [stores + int(k) for k in network.service_arcs(service)]
             rows += [row] * len(read)
             columns += read
-        self._measure = RowSum(rows, columns, 1.0, (len(services), stores + len(network.arcs)))
+        self.measure = RowSum(rows, columns, 1.0, (len(services), stores + len(network.arcs)))
         indices = np.array([network.arc_index[arc] for arc in self.arcs], dtype=np.intp)
-        self._arrivals = Arrivals(dynamics, services, indices, self._of)
+        self.arrivals = Arrivals(dynamics, services, indices, self.of)
         interval = network.episode.control_interval
-        self._duration = np.array([interval if service_.quantity == "stock" else 1.0 for service_ in services])[:, None]
+        self.duration = np.array([interval if service_.quantity == "stock" else 1.0 for service_ in services])[:, None]
 
     def idle(self, agents: Container[str]) -> Bools:
         """Return which of ``arcs`` nobody acts on, shape (arcs, 1)."""
         return np.array([arc not in agents for arc in self.arcs], dtype=bool).reshape(-1, 1)
+
+    def bounds(self, step: Integers, factors: Floats | None) -> tuple[Floats, Floats]:
+        """Return the least and the most that each of ``arcs`` can supply in an interval of each copy, (arcs, B)."""
+        low = self.drawn(self._dynamics.control_low[self.rows].take(step, axis=1), factors)
+        return low, self._dynamics.capacity_in(step, factors)[self.rows]
 
     def __call__(
         self,
@@ -143,21 +158,20 @@ class Supply:
         self, stock: Floats, inner: Floats, controls: Floats, step: Integers, idle: Bools, factors: Floats | None
     ) -> tuple[Floats, Transition]:
         """Do what ``advance`` does, for copies so few that all they take stays in a cache."""
-        dynamics, batch, count = self._dynamics, controls.shape[1], len(self._demand)
-        low = self._drawn(dynamics.control_low[self._rows].take(step, axis=1), factors)
-        high = dynamics.capacity_in(step, factors)[self._rows]
-        demand = self._factors(self._demand.take(step, axis=1), factors)
-        weights = np.where(idle, self._weights, 0.0)
+        dynamics, batch, count = self._dynamics, controls.shape[1], len(self.demand)
+        low, high = self.bounds(step, factors)
+        demand = self.demand_factors(self.demand.take(step, axis=1), factors)
+        weights = np.where(idle, self.weights, 0.0)
         reach = np.divide(np.maximum(high - low, 0.0), weights, out=np.zeros_like(low), where=weights > 0)
-        most, furthest = self._total(weights * reach), np.zeros((count, batch))
-        np.maximum.at(furthest, self._of, reach)
+        most, furthest = self.total(weights * reach), np.zeros((count, batch))
+        np.maximum.at(furthest, self.of, reach)
 
         def extents(supply: Floats) -> Floats:
             """Return v, at which arcs supply U, shape (services, B)."""
             extent = np.zeros_like(supply)
             for _ in range(self._most_arcs):  # U is concave in v: each tangent leads past a bend, or to the end
-                lack = supply - self._total(weights * np.minimum(extent[self._of], reach))
-                per_extent = self._total(np.where(extent[self._of] < reach, weights, 0.0))
+                lack = supply - self.total(weights * np.minimum(extent[self.of], reach))
+                per_extent = self.total(np.where(extent[self.of] < reach, weights, 0.0))
                 extent += np.divide(lack, per_extent, out=np.zeros_like(lack), where=per_extent > 0)
             return np.where(supply < most, extent, furthest)
 
@@ -170,9 +184,9 @@ class Supply:
         for terms, accuracy, rounds in ((TERMS, SURE, GUESSES), (None, CLOSE, ROUNDS)):
             open_, expected = np.ones(batch, dtype=bool), np.zeros((count, batch))
             for correction in range(rounds + 1):
-                extent = extents(supply)[self._of]
+                extent = extents(supply)[self.of]
                 target = np.minimum(low + weights * extent, high)
-                all_controls[self._rows] = np.where(idle, target, controls[self._rows])
+                all_controls[self.rows] = np.where(idle, target, controls[self.rows])
                 copies = np.flatnonzero(open_)
                 part = dynamics.advance(
                     stock.take(copies, axis=1),
@@ -194,13 +208,13 @@ class Supply:
                 has_room = (weights > 0) & (extent < reach)
                 bends = np.ones((count, batch), dtype=bool)
                 if room is not None:
-                    bends = self._total((has_room != room).astype(float)) > 0
-                per_extent = self._total(np.where(has_room, weights, 0.0))[self._of]
+                    bends = self.total((has_room != room).astype(float)) > 0
+                per_extent = self.total(np.where(has_room, weights, 0.0))[self.of]
                 unit = np.divide(weights, per_extent, out=np.zeros_like(weights), where=has_room)
-                self._arrivals.update(slope, rate, routes, unit, bends)
+                self.arrivals.update(slope, rate, routes, unit, bends)
                 room = has_room
                 # copy by copy in memory, so that sums have the same order whatever the batch
-                per_supply = slope * np.ascontiguousarray((self._duration * factor).T)[..., None]
+                per_supply = slope * np.ascontiguousarray((self.duration * factor).T)[..., None]
                 before, wrong = supply.copy(), np.flatnonzero(is_wrong)
                 short, now, high_ = (array.take(wrong, axis=1) for array in (shortage, supply, most))
                 supply[:, wrong] = _complementary(per_supply[wrong], short, now, high_, interval)
@@ -215,7 +229,7 @@ class Supply:
     def _quantities(self, done: Transition) -> Floats:
         """Return what the services measure at the end of an interval, shape (services, B)."""
         flow = done.moved_mass / self._dynamics.network.episode.control_interval
-        return self._measure(np.concatenate([self._dynamics.rows.stocks(done.stock), flow]))
+        return self.measure(np.concatenate([self._dynamics.rows.stocks(done.stock), flow]))
 
 
 def _with_copies(done: Transition, copies: Integers, part: Transition) -> Transition:

@@ -25,6 +25,9 @@ class Taylor:
 
     Attributes:
         terms: terms of the series.
+        driver: row of ``drivers`` by which each arc flows, shape (arcs,).
+        horner: S times the length that counts in each of them, from the innermost.
+        pulls: whether a recipient may ask for more than there is.
     """
 
     def __init__(self, laws: FlowLaws, substep: float) -> None:
@@ -33,13 +36,13 @@ class Taylor:
         self.terms = self._number()
         # Horner from the innermost term: h/K, …, h/3, h/2
         factors = [substep / k for k in range(self.terms, 1, -1)]
-        self._pulls = any(arc.law is Law.RECIPIENT for arc in laws.staged_network.arcs)
-        self._horner = [laws.incidence.scaled_by(factor) for factor in factors]
+        self.pulls = any(arc.law is Law.RECIPIENT for arc in laws.staged_network.arcs)
+        self.horner = [laws.incidence.scaled_by(factor) for factor in factors]
         self._shortcut = KronReduction(laws, factors) if laws.routing.nodes else None
         network, routing, stores = laws.staged_network, laws.routing, laws.rows.nodes.stop
         # throughputs stand below the masses, and drive what leaves nodes without stock
-        self._driver = laws.driver.copy()
-        self._driver[routing.arcs] = laws.rows.masses + routing.throughput_rows
+        self.driver = laws.driver.copy()
+        self.driver[routing.arcs] = laws.rows.masses + routing.throughput_rows
         self._inflows = np.flatnonzero((network.donors < stores) & (network.recipients >= stores))
         entry_places = routing.places[network.recipients[self._inflows] - stores]
         self._into = RowSum(entry_places, range(len(entry_places)), 1.0, (routing.nodes, len(entry_places)))
@@ -80,21 +83,25 @@ class Taylor:
         else:
             transfer = self._mean_flow(stock, routes, terms, rate, imposed_flow)
         transfer *= self._substep
-        if self._pulls:
+        if self.pulls:
             np.maximum(transfer, 0.0, out=transfer)  # the mean of an overdrawn stock may be negative
         return transfer
 
     def flow(self, masses: Floats, routes: IntervalRoutes | None, rate: Floats) -> Floats:
         """Return the flows at ``masses``, those that are passed on too, shape (arcs, B)."""
-        laws = self._laws
         if routes is None:
-            return laws.flow(masses, rate)
-        inflow = masses.take(laws.driver[self._inflows], 0)
-        inflow *= rate.take(self._inflows, 0)
-        through = laws.routing.throughputs(self._into(inflow), routes)
-        flow: Floats = np.concatenate([masses, through]).take(self._driver, 0)
+            return self._laws.flow(masses, rate)
+        flow: Floats = self.drivers(masses, routes, rate).take(self.driver, 0)
         flow *= rate
         return flow
+
+    def drivers(self, masses: Floats, routes: IntervalRoutes | None, rate: Floats) -> Floats:
+        """Return the masses, and below them what passes through nodes without stock: what drives each arc."""
+        if routes is None:
+            return masses
+        inflow = masses.take(self._laws.driver[self._inflows], 0)
+        inflow *= rate.take(self._inflows, 0)
+        return np.concatenate([masses, self._laws.routing.throughputs(self._into(inflow), routes)])
 
     def _mean_flow(
         self,
@@ -106,7 +113,7 @@ class Taylor:
     ) -> Floats:
         """Return r∘ȳ[driver], with the flows of all arcs in each term."""
         laws, flow, mean = self._laws, np.empty_like(rate), stock.copy()
-        for incidence in (*self._horner[-(terms or self.terms) :], None):
+        for incidence in (*self.horner[-(terms or self.terms) :], None):
             mean.take(laws.driver, axis=0, out=flow, mode="clip")
             flow *= rate
             if imposed_flow is not None:

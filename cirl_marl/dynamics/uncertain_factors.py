@@ -66,6 +66,18 @@ class IntervalFactors:
             factors[row] += now[name] * part.take(np.minimum(step, self._last))
         return factors
 
+    def pull_back(self, draws: Floats, values: Floats, step: Integers, adjoint: Floats, path_adjoint: Floats) -> Floats:
+        """Return derivatives by the draws of those by the factors, and add those by the values to ``path_adjoint``."""
+        now, copies, factors = interval_of(values, step), np.arange(len(step)), np.ones_like(adjoint)
+        factors[: self._draws] = draws
+        by_draw = adjoint.copy()
+        for row, name in self._times:
+            path_adjoint[step, name, copies] += adjoint[row] * factors[row]
+            by_draw[row] *= now[name]
+        for row, name, part in self._added:
+            path_adjoint[step, name, copies] += adjoint[row] * part.take(np.minimum(step, self._last))
+        return by_draw[: self._draws]
+
 
 class RowFactors:
     """Rows of a table that uncertain numbers multiply.
@@ -86,6 +98,10 @@ class RowFactors:
         product = np.repeat(table, factors.shape[1] // table.shape[1], axis=1)
         product[self.rows] *= factors.take(self._numbers, axis=0)
         return product
+
+    def pull_back(self, table: Floats, adjoint: Floats, factor_adjoint: Floats) -> None:
+        """Add to the adjoint of the factors what that of ``table`` times them, shape (rows, B), brings."""
+        np.add.at(factor_adjoint, self._numbers, adjoint[self.rows] * table[self.rows])
 
 
 def capacity_numbers(network: Network, ranges: Mapping[str, tuple[float, float]]) -> dict[int, int]:
@@ -121,6 +137,13 @@ class ControlFactors:
         if drawn is not table and len(self._shares):
             drawn[self._shares] = np.minimum(drawn[self._shares], 1.0)
         return drawn
+
+    def pull_back(self, table: Floats, factors: Floats, adjoint: Floats, factor_adjoint: Floats) -> None:
+        """Add to the adjoint of the factors what that of controls as they were drawn, shape (rows, B), brings."""
+        if len(self._shares):
+            adjoint = adjoint.copy()
+            adjoint[self._shares] *= self._factors(table, factors)[self._shares] <= 1.0
+        self._factors.pull_back(table, adjoint, factor_adjoint)
 
     def extreme(self, table: Floats, end: int) -> Floats:
         """Return a table of controls under the lowest (0) or the highest (1) factors."""
@@ -167,6 +190,15 @@ class FlowFactors:
     def multiply(self, rate: Floats, factors: Floats) -> None:
         """Multiply what was drawn into the rates of arcs, shape (arcs, B), in place."""
         if len(self.arcs):
-            multipliers = factors.take(self._numbers, axis=0)
-            multipliers[self._inverse_rows] = 1.0 / multipliers[self._inverse_rows]
-            rate[self.arcs] *= multipliers
+            rate[self.arcs] *= self.multipliers(factors)
+
+    def multipliers(self, factors: Floats) -> Floats:
+        """Return by what each of ``arcs`` is multiplied: a stretch divides."""
+        multipliers = factors.take(self._numbers, axis=0)
+        multipliers[self._inverse_rows] = 1.0 / multipliers[self._inverse_rows]
+        return multipliers
+
+    def pull_back(self, factors: Floats, adjoint: Floats, factor_adjoint: Floats) -> None:
+        """Add to the adjoint of the factors what that of the ``multipliers`` brings, which is used up."""
+        adjoint[self._inverse_rows] *= -(self.multipliers(factors)[self._inverse_rows] ** 2)
+        np.add.at(factor_adjoint, self._numbers, adjoint)

@@ -122,6 +122,21 @@ class Actuators:
         controls[self.control_rows] = values
         return controls
 
+    def pull_back(
+        self, actions: Floats, step: Integers, factors: Floats | None, adjoint: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return derivatives of ``controls`` by actions, and by low, neutral and high values of all controls.
+
+        Of a functional whose derivatives by the controls, (controls, B), are the ``adjoint``; shapes are (entries, B)
+        and (3, controls, B). At a bound that of an action is the derivative from within.
+        """
+        _, _, half, _ = self._bounds_in(step, factors)
+        ends, own = np.zeros((3, *adjoint.shape)), adjoint[self.control_rows]
+        ends[1] = adjoint
+        ends[0, self.control_rows], ends[2, self.control_rows] = own * (1.0 - actions) / 2, own * (1.0 + actions) / 2
+        ends[1, self.control_rows] = 0.0
+        return own * half, ends
+
     def _bounds_in(self, step: Integers, factors: Floats | None) -> Sequence[Floats]:
         """Return low, middle, half of the range and high of the agents' controls, shape (entries, B) each."""
         bounds = tuple(table.take(step, axis=1) for table in self._bounds) if self._vary_in_time else self._bounds

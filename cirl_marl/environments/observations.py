@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box
@@ -13,7 +14,7 @@ from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import OBSERVE, Arc
 from cirl_marl.network.processes import DisturbanceProcesses, interval_of
-from cirl_marl.network.rowsum import spans
+from cirl_marl.network.rowsum import RowSum, spans
 
 
 class Signals:
@@ -107,6 +108,15 @@ class Sights:
         sight *= self._inverse_size
         return sight
 
+    def pull_back(self, step: Integers, adjoint: Floats, path_adjoint: Floats) -> None:
+        """Add derivatives by what is seen, shape (rows, B), to those by the values, shape (intervals, names, B).
+
+        Forecasts follow from the states of the processes, and so do not change with the values.
+        """
+        for rows, n, delay, _ in self._parts:
+            copies = np.flatnonzero(step >= delay)
+            path_adjoint[step[copies] - delay, n, copies] += (adjoint * self._inverse_size)[rows.start, copies]
+
 
 class ObservationLayout:
     """Which signals each agent sees, in which order, within which bounds.
@@ -167,23 +177,36 @@ class ObservationLayout:
         set_points = np.array([c.set_point or 0.0 for c in network.compartments.values()]) / scales
         self._table = np.zeros((signals.rows, batch), dtype=np.float32)
         self._table[signals.set_points] = set_points[:, None]
+        self._signal_sum = RowSum(self._index, np.arange(len(self._index)), 1.0, (signals.rows, len(self._index)))
 
     def observe(
-        self, quantities: Floats, time: Floats, levels: Floats, sight: Floats | None = None
-    ) -> NDArray[np.float32]:
+        self, quantities: Floats, time: Floats, levels: Floats, sight: Floats | None = None, table: Any = None
+    ) -> NDArray[Any]:
         """Return the stacked observation, shape (entries of all agents, B).
 
         It follows from the quantities of ``Signals``, shape (quantities, B), the elapsed share of the episode, shape
-        (B,), the service levels, shape (services, B), and what is seen of disturbances (``Sights.see``).
+        (B,), the service levels, shape (services, B), and what is seen of disturbances (``Sights.see``). It is written
+        by way of a ``table`` of single precision, or of one like it of another.
         """
-        table = self._table
+        table = self._table if table is None else table
         with np.errstate(over="ignore"):
             np.multiply(quantities, self._inverse_scale, out=table[: self.signals.quantities], casting="same_kind")
         table[self.signals.time] = time
         table[self.signals.levels] = levels
         if sight is not None:
             table[self.signals.seen] = sight
-        return table.take(self._index, axis=0)
+        observation: NDArray[Any] = table.take(self._index, axis=0)
+        return observation
+
+    def double_table(self) -> Floats:
+        """Return a table for ``observe`` of double precision."""
+        return self._table.astype(np.float64)
+
+    def pull_back(self, adjoint: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return derivatives by quantities, levels and sights of those by the observation, shape (entries, B)."""
+        signals, by_signal = self.signals, self._signal_sum(adjoint)
+        quantities = by_signal[: signals.quantities] * self._inverse_scale
+        return quantities, by_signal[signals.levels], by_signal[signals.seen]
 
     def _common_order(self, agents: Sequence[str], mode: str) -> tuple[str, ...]:
         if mode == "stocks":

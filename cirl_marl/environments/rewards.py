@@ -98,16 +98,44 @@ class Scoring:
 
         ``factors`` are those on the numbers that are not certain, in that interval, shape (numbers, B), if any.
         """
-        quantity = self._measure(quantities)
-        low, high = self._low, self._high
-        if self._vary_in_time:
-            low, high = low.take(step, axis=1), high.take(step, axis=1)
-        low, high = (scale(band, factors) for scale, band in zip(self._factors, (low, high), strict=True))
+        quantity, (low, high) = self._measure(quantities), self._bands(step, factors)
         level: Floats = np.divide(quantity, low, out=np.ones_like(quantity), where=low > 0)
         if self._has_high:
             np.divide(high, quantity, out=level, where=quantity > high)
         np.minimum(level, 1.0, out=level)
         return np.maximum(level, 0.0, out=level)
+
+    def pull_back(
+        self,
+        quantities: Floats,
+        step: Integers,
+        factors: Floats | None,
+        adjoint: Floats,
+        factor_adjoint: Floats | None = None,
+    ) -> Floats:
+        """Return derivatives by the quantities, shape (quantities, B), of those by the ``levels``, (services, B).
+
+        What they bring by the factors on bands is added to ``factor_adjoint``. At the end of a band the derivative is
+        that from within, 0.
+        """
+        quantity, (low, high) = self._measure(quantities), self._bands(step, factors)
+        is_above, is_below = quantity > high, (quantity < low) & (quantity >= 0)
+        per_low = np.divide(adjoint, low, out=np.zeros_like(quantity), where=is_below)
+        per_quantity = np.divide(adjoint, quantity, out=np.zeros_like(quantity), where=is_above)
+        over = np.where(is_above, high / np.where(is_above, quantity, 1.0), 0.0)
+        if factors is not None and factor_adjoint is not None:
+            tables = (band.take(step, axis=1) if self._vary_in_time else band for band in (self._low, self._high))
+            parts = np.divide(-per_low * quantity, low, out=np.zeros_like(quantity), where=is_below), per_quantity
+            for scale, table, part in zip(self._factors, tables, parts, strict=True):
+                scale.pull_back(np.where(np.isfinite(table), table, 0.0), part, factor_adjoint)
+        return self._measure.transpose()(per_low - per_quantity * over)
+
+    def _bands(self, step: Integers, factors: Floats | None) -> tuple[Floats, Floats]:
+        low, high = self._low, self._high
+        if self._vary_in_time:
+            low, high = low.take(step, axis=1), high.take(step, axis=1)
+        low, high = (scale(band, factors) for scale, band in zip(self._factors, (low, high), strict=True))
+        return low, high
 
     def terms(self, quantities: Floats, levels: Floats, inner: Floats) -> Floats:
         """Return every squared scaled distance, service shortfall and model's reward, shape (terms, B)."""

@@ -67,6 +67,8 @@ class MultiAgentVectorEnv:
         observation_names: by agent, what each entry of its observation is.
         action_spaces: by agent; Box(−1, 1), mapped linearly to the bounds of the control.
         rows: which row of the physical state is what.
+        actuators: from actions to controls.
+        idle: which arcs of ``supply`` nobody acts on.
         supply: the arcs that make up for services.
         controls: their values in the last interval, in the rows of ``network.control_rows``, (controls, num_envs).
         state_names: nodes, ``compartment.state`` of the inner states, ``arc.row`` of the masses of batch arcs, and
@@ -131,12 +133,12 @@ class MultiAgentVectorEnv:
         self.uncertain = uncertain
         self.dynamics = Dynamics(variant, uncertain=uncertain)
         self.supply = Supply(self.dynamics)
-        self._actuators = Actuators(variant, agents, num_envs, self.dynamics.factors.ranges)
-        self.agents = self._actuators.agents
-        self.action_spaces = self._actuators.spaces
+        self.actuators = Actuators(variant, agents, num_envs, self.dynamics.factors.ranges)
+        self.agents = self.actuators.agents
+        self.action_spaces = self.actuators.spaces
         self.layout = ObservationLayout(self.dynamics, self.agents, observe, num_envs)
         self.scoring = Scoring(self.dynamics, self.layout, self.agents, num_envs)
-        self._idle = self.supply.idle(self.agents)
+        self.idle = self.supply.idle(self.agents)
         self._credit = Credit(self.dynamics, self.supply, self.scoring, self.agents, self.reward_mode, moment)
         self.observation_spaces = self.layout.spaces
         self.observation_names = self.layout.names
@@ -179,12 +181,12 @@ class MultiAgentVectorEnv:
         """
         step, state = self._next_interval(), self._state
         factors = None if state is None else self.factors_in(step)
-        joint: dict[str, Floats] = self._actuators.neutral_action(step, factors) | {
+        joint: dict[str, Floats] = self.actuators.neutral_action(step, factors) | {
             a: np.asarray(x) for a, x in actions.items()
         }
         suppliers = [arc for arc in self.supply.arcs if arc in self.agents and arc not in actions]
         if suppliers and state is not None and (state.step < self.network.episode.horizon).all():
-            controls = self._actuators.controls(self.stack(joint), step, factors)
+            controls = self.actuators.controls(self.stack(joint), step, factors)
             idle = self.supply.idle([agent for agent in self.agents if agent not in suppliers])
             controls = self.supply(state.stock, state.inner, controls, step, idle, factors)
             for arc in suppliers:
@@ -198,12 +200,12 @@ class MultiAgentVectorEnv:
         """
         step = self._next_interval()
         factors = None if self._state is None else self.factors_in(step)
-        return self._actuators.normalise(agent, values, step, factors).T
+        return self.actuators.normalise(agent, values, step, factors).T
 
     def control_values(self, actions: Mapping[str, ArrayLike]) -> Floats:
         """Return the values of all controls under actions of all agents in the coming interval, (controls, B)."""
         step = self._next_interval()
-        return self._actuators.controls(self.stack(actions), step, self.factors_in(step))
+        return self.actuators.controls(self.stack(actions), step, self.factors_in(step))
 
     @property
     def physical(self) -> State:
@@ -324,7 +326,7 @@ class MultiAgentVectorEnv:
         set-points; a surplus is negative.
         """
         state, step = self.physical, self._next_interval()
-        services = self.scoring.lack(self._quantities(state), step, self.factors_in(step))
+        services = self.scoring.lack(self.quantities(state), step, self.factors_in(step))
         lacks = dict(zip(self._services, services, strict=True))
         for node, stock in zip(self.network.stores, self.rows.stocks(state.stock), strict=True):
             if node.set_point:
@@ -346,11 +348,11 @@ class MultiAgentVectorEnv:
 
     def stack(self, actions: Mapping[str, ArrayLike]) -> Floats:
         """Stack the actions of all agents, shape (entries, B); the checks of ``step`` apply."""
-        return self._actuators.stack(actions)
+        return self.actuators.stack(actions)
 
     def unstack(self, actions: Floats) -> dict[str, Floats]:
         """Split stacked actions, shape (entries, B), into agent → (B, entries of its action)."""
-        return self._actuators.unstack(actions)
+        return self.actuators.unstack(actions)
 
     def advance(self, actions: Floats) -> Outcome:
         """Hold stacked actions, shape (entries, B), for one control interval; no copy is restarted.
@@ -364,8 +366,8 @@ class MultiAgentVectorEnv:
         if (state.step >= horizon).any():
             raise ControlError(f"the episode is over after {horizon} steps: call reset()")
         factors = self.factors_in(state.step)
-        controls = self._actuators.controls(actions, state.step, factors)
-        controls, transition = self.supply.advance(state.stock, state.inner, controls, state.step, self._idle, factors)
+        controls = self.actuators.controls(actions, state.step, factors)
+        controls, transition = self.supply.advance(state.stock, state.inner, controls, state.step, self.idle, factors)
         self.controls = controls
         quantities, flow = self._measure(transition, controls)
         levels = self.scoring.levels(quantities, state.step, factors)
@@ -384,11 +386,15 @@ class MultiAgentVectorEnv:
         success = dynamics.inner.successes(transition.inner, controls)
         return Outcome(observation, reward, local, circularity, mean, levels, service, flow, step >= horizon, success)
 
+    def go_back(self, state: State, controls: Floats) -> None:
+        """Go back to a state of this episode, as ``physical`` gave it, and the ``controls`` that led to it."""
+        self._state, self.controls = state, controls
+
     def local_rewards(self) -> dict[str, Floats]:
         """Return the local reward that the current state gives each compartment, acting or not, shape (B,)."""
         state = self.physical
         done = np.maximum(state.step - 1, 0)  # the interval that the state is scored in
-        quantities = self._quantities(state)
+        quantities = self.quantities(state)
         factors = self.factors_in(done)
         inner = self.dynamics.inner.rewards(state.inner, state.inner, self.dynamics.neutral_in(done, factors))
         levels = self.scoring.levels(quantities, done, factors)
@@ -500,17 +506,23 @@ class MultiAgentVectorEnv:
         flow.flags.writeable = False  # infos hand it out, and the state keeps it
         return quantities, flow
 
-    def _quantities(self, state: State) -> Floats:
+    def quantities(self, state: State) -> Floats:
+        """Return the quantities of a state, in the rows of ``layout.signals``, shape (quantities, B)."""
         loads = self.dynamics.batches.loads(state.stock)
         through = self.network.throughput(state.flow)
         return np.concatenate([self.rows.stocks(state.stock), through, state.flow, state.inner, state.measures, loads])
 
-    def _observe(self, state: State) -> NDArray[np.float32]:
-        quantities = self._quantities(state)
+    def observe_into(self, table: Floats) -> Floats:
+        """Return the stacked observation by way of ``table``, of its precision (``ObservationLayout.observe``)."""
+        return self._observe(self.physical, table)
+
+    def _observe(self, state: State, table: Floats | None = None) -> NDArray[Any]:
+        quantities = self.quantities(state)
         time = state.step / self.network.episode.horizon
         done = np.maximum(state.step - 1, 0)
         factors = self.dynamics.factors(state.factors, state.disturbances, done)
-        return self.layout.observe(quantities, time, self.scoring.levels(quantities, done, factors), self._sight(state))
+        levels = self.scoring.levels(quantities, done, factors)
+        return self.layout.observe(quantities, time, levels, self._sight(state), table)
 
     def _sight(self, state: State) -> Floats | None:
         """Return what the disturbances show of themselves, in the rows of ``layout.sights``; None if nothing."""

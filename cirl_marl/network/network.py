@@ -292,6 +292,17 @@ class Network(Specification):
         circularity: Floats = (parts[0] + through).reshape(flow.shape[1:])
         return circularity
 
+    def circularity_adjoint(self, flow: Floats) -> Floats:
+        """Return dλ/df, shape (arcs, B), mass per mass/time; where a net flow to the environment is 0, as if it were 1.
+
+        Args:
+            flow: f, shape (arcs, B), mass/time.
+        """
+        signs = np.ones((2, flow.shape[1]))
+        if self.objective.net_zero == "abs":
+            signs[1] = np.where(self._circularity_parts(flow)[1] > 0, -1.0, 1.0)
+        return self._circularity_parts.transpose()(signs)
+
     @cached_property
     def circularity_weights(self) -> Floats:
         """−Δ·σ_rest and −Δ·σ_env, weights in λ of flows not through and through the environment, shape (2, arcs)."""
@@ -313,6 +324,10 @@ class Network(Specification):
         columns = math.prod(flow.shape[1:])
         through = self._throughputs(np.ascontiguousarray(flow).reshape(len(self.arcs), columns))
         return through.reshape(-1, *flow.shape[1:])
+
+    def throughput_adjoint(self, worth: Floats) -> Floats:
+        """Return derivatives by the flows, shape (arcs, B), of those by the throughputs, shape (nodes, B)."""
+        return self._throughputs.transpose()(worth)
 
     @cached_property
     def _throughputs(self) -> RowSum:

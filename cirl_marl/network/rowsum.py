@@ -113,6 +113,12 @@ class RowSum:
         matrix._weights = self._weights * factor
         return matrix
 
+    def transpose(self, *, reverse: bool = False) -> RowSum:
+        """Return Wᵀ; with ``reverse`` rows and columns in the opposite order, so that it can ``substitute`` again."""
+        columns = np.repeat(np.arange(self.shape[1]), np.diff(self._starts))
+        rows, ends = (self.shape[0] - 1 - self._rows, self.shape[1] - 1 - columns) if reverse else (self._rows, columns)
+        return RowSum(ends, rows, self._weights, self.shape[::-1])
+
     def column_sums(self) -> Floats:
         """Return Σ_i W_ik for each column k."""
         sums: Floats = np.add.reduceat(np.append(self._weights, 0.0), self._starts[:-1])

@@ -1,0 +1,161 @@
+"""Exact derivatives of episodes: by actions, by what they start from, and by what disturbs them."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cirl_marl.dynamics.adjoint import Adjoint, IntervalInputs
+from cirl_marl.dynamics.supply_adjoint import SupplyAdjoint
+from cirl_marl.environments.state import State
+from cirl_marl.environments.vector import MultiAgentVectorEnv
+from cirl_marl.errors import ControlError
+from cirl_marl.network import Floats
+from cirl_marl.network.declarations import positional_record
+
+
+@positional_record
+class Interval:
+    """What the way back through an interval needs."""
+
+    before: Annotated[State, "the state at its start"]
+    after: Annotated[State, "the state at its end"]
+    actions: Annotated[Floats, "stacked actions, shape (entries, B)"]
+    controls: Annotated[Floats, "controls with what supplies made up for, shape (controls, B)"]
+
+
+@positional_record
+class Outputs:
+    """What an interval ended with, or derivatives by it."""
+
+    stock: Annotated[Floats, "masses, shape (masses, B)"]
+    circularity: Annotated[Floats, "mean of λ over the interval, shape (B,)"]
+    levels: Annotated[Floats, "service levels, shape (services, B)"]
+    observation: Annotated[Floats, "stacked observation in double precision, shape (entries of all agents, B)"]
+
+
+@positional_record
+class Gradient:
+    """What open-loop actions do, and the derivatives of c·λ̄ + Σ_s w_s·l_s, in each copy."""
+
+    circularity: Annotated[Floats, "λ̄, mean of λ over the intervals, shape (B,), mass"]
+    levels: Annotated[Floats, "l, mean level of each service, shape (services, B)"]
+    actions: Annotated[Floats, "by the actions, shape (intervals, entries, B)"]
+    start: Annotated[Floats, "by the stocks at the start, those with a lifetime by stage, shape (stocks, B), 1/mass"]
+    disturbances: Annotated[Floats, "by the values of the disturbances, shape (intervals, names, B)"]
+    draws: Annotated[Floats, "by the factors on uncertain numbers, shape (numbers, B)"]
+
+
+class Derivatives:
+    """Intervals of a batched environment, forwards and backwards.
+
+    Derivatives by disturbances are those by the values ξ; forecasts, which follow from the states behind them, stay.
+    """
+
+    def __init__(self, env: MultiAgentVectorEnv) -> None:
+        """Compile the adjoint of ``env``; a ``CirlError`` says what of it has no derivative."""
+        self.env, self._adjoint = env, Adjoint(env.dynamics)
+        self._supply = SupplyAdjoint(env.supply, self._adjoint)
+        self._table = env.layout.double_table()
+
+    def advance(self, actions: Floats) -> tuple[Interval, Outputs]:
+        """Hold stacked actions, shape (entries, B), for an interval, as ``MultiAgentVectorEnv.advance`` does."""
+        env, before = self.env, self.env.physical
+        outcome = env.advance(actions)
+        interval = Interval(before, env.physical, actions, env.controls)
+        return interval, Outputs(
+            env.physical.stock, outcome.circularity_mean, outcome.levels, env.observe_into(self._table)
+        )
+
+    def pull_back(self, interval: Interval, adjoint: Outputs, path_adjoint: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return derivatives by masses at the start, actions and draws, given those by what an interval ended with.
+
+        Those by the values of the disturbances are added to ``path_adjoint``, shape (intervals, names, B).
+        """
+        env, before, after = self.env, interval.before, interval.after
+        network, signals, step = env.network, env.layout.signals, before.step
+        factors = env.dynamics.factors(before.factors, before.disturbances, step)
+        by_quantity, by_level, by_sight = env.layout.pull_back(adjoint.observation)
+        factor_adjoint = None if factors is None else np.zeros_like(factors)
+        levels = adjoint.levels + by_level
+        by_quantity += env.scoring.pull_back(env.quantities(after), step, factors, levels, factor_adjoint)
+        by_flow = by_quantity[signals.flows] + network.circularity_adjoint(after.flow) * adjoint.circularity
+        by_flow += network.throughput_adjoint(by_quantity[signals.throughputs])
+        stock = adjoint.stock + env.rows.masses_adjoint(by_quantity[signals.stocks])
+        inputs = IntervalInputs(before.stock, interval.controls, factors)
+        moved = by_flow / network.episode.control_interval
+        result = self._supply.pull_back(inputs, step, env.idle, stock, moved)
+        actions, ends = env.actuators.pull_back(interval.actions, step, factors, result.controls)
+        if env.layout.sights:
+            env.layout.sights.pull_back(after.step, by_sight, path_adjoint)
+        draws = np.zeros_like(before.factors)
+        if factors is not None and factor_adjoint is not None and result.factors is not None:
+            factor_adjoint += result.factors
+            self._adjoint.rates.pull_back_bounds(step, factors, ends, factor_adjoint)
+            draws = env.dynamics.factors.pull_back(
+                before.factors, before.disturbances, step, factor_adjoint, path_adjoint
+            )
+        return result.stock, actions, draws
+
+    def open_loop(self, actions: Floats, circularity: ArrayLike = 1.0, levels: ArrayLike = 0.0) -> Gradient:
+        """Return ``gradient`` of actions that have its shape."""
+        env, (steps, _, batch) = self.env, actions.shape
+        state, controls, services = env.physical, env.controls, len(env.network.services)
+        try:
+            tape = [self.advance(action) for action in actions]
+        finally:
+            env.go_back(state, controls)
+        by_circularity = np.broadcast_to(np.asarray(circularity, dtype=float), (batch,)) / steps
+        weights = np.asarray(levels, dtype=float)
+        by_level = np.broadcast_to(weights if weights.ndim == 2 else weights.reshape(-1, 1), (services, batch)) / steps
+        stock, draws = np.zeros_like(state.stock), np.zeros_like(state.factors)
+        paths, by_action = np.zeros_like(state.disturbances), np.empty(actions.shape)
+        for t in reversed(range(steps)):
+            interval, outputs = tape[t]
+            adjoint = Outputs(stock, by_circularity, by_level, np.zeros_like(outputs.observation))
+            stock, by_action[t], drawn = self.pull_back(interval, adjoint, paths)
+            draws += drawn
+        mean_circularity = np.mean([outputs.circularity for _, outputs in tape], axis=0)
+        mean_levels = np.mean([outputs.levels for _, outputs in tape], axis=0)
+        return Gradient(mean_circularity, mean_levels, by_action, stock[env.rows.nodes], paths, draws)
+
+
+def gradient(
+    env: MultiAgentVectorEnv, actions: ArrayLike, *, circularity: ArrayLike = 1.0, levels: ArrayLike = 0.0
+) -> Gradient:
+    """Return what open-loop actions do from here, and exact derivatives of c·λ̄ + Σ_s w_s·l_s, copy by copy.
+
+    λ̄ and l_s are means over the intervals. The environment stays where it is. Derivatives are those of the simulator:
+    cuts of flows, clips and supplies that make up for services are in them. At a kink they are one-sided: of a flow as
+    if it were not cut, of a level as within its band, of an action from within its bounds.
+
+    Args:
+        env: after ``reset``.
+        actions: stacked actions, shape (intervals, entries, num_envs), or without the last axis.
+        circularity: c, a number or shape (num_envs,).
+        levels: w, a number, shape (services,) or (services, num_envs).
+
+    Raises:
+        CirlError: for what has no derivative: compartments with models, batches, other solvers than ``exact``, and
+            stocks that recipients empty; names the network, the compartment and the reason.
+        ControlError: for actions of another shape or out of bounds.
+    """
+    return Derivatives(env).open_loop(stacked_schedule(env, actions), circularity, levels)
+
+
+def stacked_schedule(env: MultiAgentVectorEnv, actions: ArrayLike) -> Floats:
+    """Return actions of several intervals, shape (intervals, entries, B), from those or from (intervals, entries).
+
+    Raises:
+        ControlError: for another shape, or for more intervals than are left of the episode.
+    """
+    schedule = np.asarray(actions, dtype=np.float64)
+    entries, left = len(env.actuators.control_rows), env.network.episode.horizon - int(env.physical.step.max())
+    if schedule.ndim == 2:
+        schedule = np.repeat(schedule[..., None], env.num_envs, axis=2)
+    if schedule.ndim != 3 or schedule.shape[1:] != (entries, env.num_envs) or not 1 <= len(schedule) <= left:
+        expectation = f"(intervals, {entries}) or (intervals, {entries}, {env.num_envs}) with 1 to {left} intervals"
+        raise ControlError(f"actions have shape {np.shape(actions)}, expected {expectation}")
+    return schedule
