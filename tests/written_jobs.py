@@ -37,7 +37,7 @@ class Written:
             sys.stderr.flush()
             os.kill(os.getpid(), signal.SIGKILL)
         if self.does == "wait":
-            time.sleep(60)
+            time.sleep(300)
         if self.does == "count":  # to 100 seconds, over several workers
             counted = self.file.with_suffix(".counted")
             for second in range(int(counted.read_text()) if counted.is_file() else 0, 100):

@@ -72,6 +72,27 @@ def is_plain(value: object) -> bool:
     return value is None or isinstance(value, bool | int | float | str | np.generic | np.ndarray)
 
 
+def require_alike(value: Any, template: Any, place: str) -> None:
+    """Raise a ``RunError`` that names the place where a tree has other keys, lengths, types or shapes than ``template``."""
+    if isinstance(template, Mapping):
+        if not isinstance(value, Mapping) or set(value) != set(template):
+            raise RunError(f"{place} is no table of {', '.join(map(str, template))}")
+        for key, part in template.items():
+            require_alike(value[key], part, f"{place}: {key}")
+    elif isinstance(template, tuple | list):
+        if not isinstance(value, tuple | list) or len(value) != len(template):
+            raise RunError(f"{place} is no list of {len(template)}")
+        for number, (part, template_part) in enumerate(zip(value, template, strict=True)):
+            require_alike(part, template_part, f"{place}, entry {number}")
+    elif isinstance(template, np.ndarray):
+        if not isinstance(value, np.ndarray) or (value.dtype, value.shape) != (template.dtype, template.shape):
+            raise RunError(f"{place} is no array of {template.dtype}, shape {template.shape}")
+    elif isinstance(value, bool) or not isinstance(
+        value, (float, int) if isinstance(template, float) else type(template)
+    ):
+        raise RunError(f"{place} is {str(value)[:60]}, not of type {type(template).__name__}")
+
+
 def _to_json(value: Any, arrays: dict[str, np.ndarray[Any, Any]], path: tuple[object, ...]) -> Any:
     """Return what stands for a value in JSON; arrays are gathered by the names on their paths."""
     if isinstance(value, torch.Tensor):

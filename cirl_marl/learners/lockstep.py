@@ -31,6 +31,7 @@ from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, ControlError, LearnerError, RunError
 from cirl_marl.learners.agent_env import AgentVecEnv, JointStep
 from cirl_marl.learners.barrier import CheckpointBarrier
+from cirl_marl.learners.checkpoint import require_alike
 from cirl_marl.learners.views import BatchedEnv, OneAgent, View
 from cirl_marl.network.declarations import positional_record
 
@@ -230,12 +231,8 @@ class NetworkWorld(World):
         Raises:
             RunError: if it holds something else than the arrays of this environment.
         """
-        streams, physical = tuple(state["streams"]), State(**state["state"])
-        for part in fields(State):
-            value, now = getattr(physical, part.name), getattr(self.env.physical, part.name)
-            if not isinstance(value, np.ndarray) or (value.dtype, value.shape) != (now.dtype, now.shape):
-                raise RunError(f"the state of the environment: {part.name} is not {now.dtype}, shape {now.shape}")
-        self.env.restore(Snapshot(physical, streams, self.env.agents, self.env.network))
+        require_alike(state, self.state_dict(), "the state of the environment")
+        self.env.restore(Snapshot(State(**state["state"]), tuple(state["streams"]), self.env.agents, self.env.network))
         self.env.circularity_weight = state["weight"]
         self.joint_steps, self._returns, self._lengths = state["joint_steps"], state["returns"], state["lengths"]
 
