@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -184,18 +185,10 @@ def save_fronts(
     figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
     axes = figure.subplots()
     for place, points in enumerate(series):
-        colour = SERIES[place % len(SERIES)]
-        line = DASHES[place % len(DASHES)] if points.is_line else ""
-        axes.plot(
-            points.service,
-            points.circularity,
-            color=colour,
-            marker=MARKERS[(place + place // len(SERIES)) % len(MARKERS)],  # colours come round before pairs do
-            linestyle=line,
-            linewidth=1.4,
-            alpha=0.9,
-            label=readable(points.name),
-        )
+        look: Any = {"linestyle": DASHES[place % len(DASHES)] if points.is_line else "", "linewidth": 1.4, "alpha": 0.9}
+        look |= {"color": SERIES[place % len(SERIES)], "label": readable(points.name)}
+        look["marker"] = MARKERS[(place + place // len(SERIES)) % len(MARKERS)]  # colours come round before pairs do
+        axes.plot(points.service, points.circularity, **look)
     _widen(axes)
     if len(bound):
         _draw_bound(axes, bound)

@@ -119,11 +119,8 @@ def decisions_table(schedule: Schedule) -> Table:
     """Return the levers that differ most from business as usual, in words, in the first, a middle and the last year."""
     count = schedule.network.episode.horizon
     steps, times = sorted({0, count // 2, count - 1}), _times(schedule.network)
-    rows = [
-        [lever.name, *(lever.text(step) for step in steps)]
-        for lever in levers(schedule)[:SHOWN_LEVERS]
-        if lever.change > 0
-    ]
+    shown = [lever for lever in levers(schedule)[:SHOWN_LEVERS] if lever.change > 0]
+    rows = [[lever.name, *(lever.text(step) for step in steps)] for lever in shown]
     headings = ["lever", *(times[step] for step in steps)]
     return text_table("what to do, beside business as usual", headings, rows, text=headings)
 

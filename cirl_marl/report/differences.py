@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -86,12 +87,10 @@ def save_alternatives(
     differ most by ``quantities``, which are what ``rank_quantities`` found.
     """
     network, quantities = simulations[0].network, quantities or rank_quantities(simulations)
-    kinds = {
-        kind: [quantity for quantity in quantities if quantity.kind == kind] for kind in ("circularity", "service")
-    }
+    circularity, services = ([q for q in quantities if q.kind == kind] for kind in ("circularity", "service"))
     rest = [quantity for quantity in quantities if quantity.kind in ("flow", "stock") and quantity.rank > 0]
     panels = []
-    for quantity in [*kinds["circularity"], *kinds["service"][:SERVICE_PANELS], *rest][:PANELS]:
+    for quantity in [*circularity, *services[:SERVICE_PANELS], *rest][:PANELS]:
         mass, name = network.mass_unit, readable(quantity.of)
         heading, unit = {
             "circularity": ("Mean circularity", f"λ / {mass}"),
@@ -108,14 +107,8 @@ def _draw(axes: Axes, simulations: Sequence[Simulation], quantity: ComparedQuant
     for i in np.flatnonzero(~np.isnan(quantity.values)).tolist():
         time, values = _trajectory(simulations[i], quantity)
         dash = DASHES[(i + i // len(SERIES)) % len(DASHES)]  # colours come round before pairs do
-        axes.plot(
-            axis_time(time, simulations[0].network),
-            values,
-            color=SERIES[i % len(SERIES)],
-            linestyle=dash,
-            marker="o" if len(time) == 1 else "",
-            label=simulations[i].name,
-        )
+        look: Any = {"color": SERIES[i % len(SERIES)], "linestyle": dash, "marker": "o" if len(time) == 1 else ""}
+        axes.plot(axis_time(time, simulations[0].network), values, label=simulations[i].name, **look)
 
 
 def _trajectory(simulation: Simulation, quantity: ComparedQuantity) -> tuple[Floats, Floats]:

@@ -173,10 +173,8 @@ def _rule_rows(explanation: Explanation) -> Rows:
     for rule in explanation.rules.rules:
         for leaf in rule.leaves:
             control = "; ".join(_digits(value) for value in leaf.control.tolist())
-            condition, action = (
-                condition_text(network, leaf.conditions) or "always",
-                action_text(network, rule.agent, leaf),
-            )
+            condition = condition_text(network, leaf.conditions) or "always"
+            action = action_text(network, rule.agent, leaf)
             shares = _digits(leaf.share), _digits(rule.explained_variance)
             yield [rule.agent, condition, action, control, *shares, *_outcome(rule.cost)]
     yield ["all together", "", "", "", "", "", *_outcome(explanation.rules.together)]
@@ -248,9 +246,8 @@ def _draw_inputs(axes: Axes, explanation: Explanation) -> None:
             start += share
         cost = number(inputs.top_held.circularity.value)
         axes.text(1.01, row, cost, va="center", fontsize=7, transform=axes.get_yaxis_transform())
-    axes.set_yticks(
-        range(len(explanation.inputs)), [compartment_label(network, inputs.agent) for inputs in explanation.inputs]
-    )
+    labels = [compartment_label(network, inputs.agent) for inputs in explanation.inputs]
+    axes.set_yticks(range(len(labels)), labels)
     axes.set_xlim(0, 1)
     axes.invert_yaxis()
     style_axes(axes, title="What agents look at, and the change of λ̄ when these inputs are held", size=8.0)

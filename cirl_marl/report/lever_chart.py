@@ -102,9 +102,8 @@ def save_levers(path: str | Path, levers: Levers, *, title: str = "") -> Path:
     shown = changes[:count]
     right.hlines(places, shown[:, [0, 2]].min(axis=1), shown[:, [0, 2]].max(axis=1), color=NEUTRAL, linewidth=1.5)
     right.plot(shown[:, 0], places, "o", color=SERIES[2], markersize=6, label="it alone")
-    right.plot(
-        shown[:, 2], places, "o", markerfacecolor="white", color=SERIES[1], markersize=6, label="lost without it"
-    )
+    hollow = {"markerfacecolor": "white", "color": SERIES[1]}
+    right.plot(shown[:, 2], places, "o", markersize=6, label="lost without it", **hollow)
     right.axvline(0.0, color=NEUTRAL, linewidth=1)
     mass = network.mass_unit
     style_axes(left, title="added to those above, and the share of all so far", size=8.5)

@@ -21,10 +21,8 @@ def weights_sentences(weights: ObjectiveWeights) -> list[str]:
     if len(weights.plans) > 1:
         plans, falls, object_ = f"These {len(weights.plans)} plans", "fall", "them"
     distance = "less than 0.01" if 100 * weights.distance < 0.01 else f"{100 * weights.distance:.2f}"
-    sentences = [
-        f"{plans} {falls} short of the best by {distance} % of what there is to be had, under the weights that suit"
-        f" {object_} best."
-    ]
+    shortfall = f"{plans} {falls} short of the best by {distance} % of what there is to be had"
+    sentences = [f"{shortfall}, under the weights that suit {object_} best."]
     if not weights.finished:
         sentences.append(f"Time ran out after {weights.programs} programs: more time may narrow what follows.")
     names, per_unit = [term.name for term in weights.terms], weights.weights(weights.centre)
@@ -41,22 +39,15 @@ def weights_sentences(weights: ObjectiveWeights) -> list[str]:
         if j not in weights.identifiable and j not in idle:
             sentences.append(f"The weight of {name} cannot be told closely: all from {' to '.join(spans[j])} fit.")
     if not weights.identifiable:
-        sentences.append(
-            "No weight is identified: "
-            + (
-                "the search was not finished; give it more time, or fewer --terms."
-                if not weights.finished
-                else f"many weights leave these plans within {100 * weights.within:.3g} % of the best. Give plans of"
-                " other starts or networks, fewer --terms, or a smaller --within."
-            )
-        )
+        reason = "the search was not finished; give it more time, or fewer --terms."
+        if weights.finished:
+            remedy = "Give plans of other starts or networks, fewer --terms, or a smaller --within."
+            reason = f"many weights leave these plans within {100 * weights.within:.3g} % of the best. {remedy}"
+        sentences.append(f"No weight is identified: {reason}")
     if idle:
         idle_names = joined_text([names[j] for j in idle])
-        reason = (
-            "nothing that can be done changes it"
-            if weights.finished
-            else "time ran out before anything changed it, so it is left out"
-        )
+        late = "time ran out before anything changed it, so it is left out"
+        reason = "nothing that can be done changes it" if weights.finished else late
         sentences.append(f"Of {idle_names} there is no telling: {reason}.")
     return sentences
 
@@ -84,7 +75,5 @@ def write_weights(weights: ObjectiveWeights, path: Path) -> Path:
 
 def _rows(weights: ObjectiveWeights) -> list[tuple[Any, ...]]:
     columns = (weights.spread, weights.low, weights.high, weights.centre, weights.weights(weights.centre))
-    figures = zip(*(column.tolist() for column in columns), strict=True)
-    return [
-        (term.name, term.kind, term.unit, term.about, *row) for term, row in zip(weights.terms, figures, strict=True)
-    ]
+    rows = zip(weights.terms, *(column.tolist() for column in columns), strict=True)
+    return [(term.name, term.kind, term.unit, term.about, *figures) for term, *figures in rows]

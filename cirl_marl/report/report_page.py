@@ -137,10 +137,8 @@ def page_of_schedule(schedule: Schedule) -> ReportPage:
     """Return the page of ``cirl plan``: business as usual, and what is planned."""
     network, note = schedule.network, schedule.note
     name = PLAN if schedule.control == "optimum" and not note else schedule.control or "trained"
-    episodes = tuple(
-        _episode(title, network, schedule.agents, outcome)
-        for title, outcome in ((USUAL, schedule.usual), (name, schedule.rollout))
-    )
+    outcomes = ((USUAL, schedule.usual), (name, schedule.rollout))
+    episodes = tuple(_episode(title, network, schedule.agents, outcome) for title, outcome in outcomes)
     notes = (f"Start: {schedule.episode_start.description}.", *filter(None, (schedule.proof, note)))
     return ReportPage(_title(network), network, episodes, notes=notes)
 

@@ -84,10 +84,8 @@ def _draws(samples: SampledEpisodes) -> tuple[list[str], list[list[object]]]:
 
 def _causes(samples: SampledEpisodes, causes: Sequence[Sensitivity]) -> tuple[list[str], list[list[object]]]:
     header = ["number", *(part for cause in causes for part in (f"share of {cause.figure}", "half-width"))]
-    return header, [
-        [samples.names[i], *(finite_or_none(float(x)) for cause in causes for x in (cause.shares[i], cause.margins[i]))]
-        for i in _order(causes)
-    ]
+    figures = np.array([column for cause in causes for column in (cause.shares, cause.margins)]).T.tolist()
+    return header, [[samples.names[i], *map(finite_or_none, figures[i])] for i in _order(causes)]
 
 
 def _quantities(samples: SampledEpisodes) -> Iterator[tuple[str, str, Floats]]:

@@ -71,17 +71,10 @@ def nodes_table(network: Network, stock: Floats) -> Table:
 def arcs_table(network: Network, flow: Floats) -> Table:
     """One row an arc: law, flow at the start, its sign in λ, set-point, control."""
     signs = {1.0: "−", -1.0: "+", 0.0: ""}
-    rows = (
-        [
-            arc.id,
-            law_text(network, arc),
-            f"{flow[k]:.5g}",
-            signs[float(network.sustainability[k])],
-            _set_point(arc),
-            control_text(network, arc),
-        ]
-        for k, arc in enumerate(network.arcs)
-    )
+    rows = []
+    for arc, amount, sustainability in zip(network.arcs, flow, network.sustainability.tolist(), strict=True):
+        figures = [f"{amount:.5g}", signs[sustainability], _set_point(arc)]
+        rows.append([arc.id, law_text(network, arc), *figures, control_text(network, arc)])
     headings, title = ["arc", "law", "flow", "in λ", "set-point", "control"], f"{network.mass_unit}/{network.time_unit}"
     return text_table(f"arcs ({title})", headings, rows, text=["arc", "law", "in λ", "control"], unbroken=["arc"])
 
@@ -141,15 +134,8 @@ def disturbances_table(network: Network) -> Table:
         low, high = part.ends
         seen = f"{part.delayed} late" if part.delayed else f"{part.forecast} ahead" if part.forecast else part.observed
         places = [path for path, effect in network.disturbed.items() if effect.by == name]
-        rows.append(
-            [
-                name,
-                part.kind,
-                f"{low:.4g} … {high:.4g} {'' if part.unit == '1' else part.unit}",
-                seen,
-                "\n".join(places),
-            ]
-        )
+        values = f"{low:.4g} … {high:.4g} {'' if part.unit == '1' else part.unit}"
+        rows.append([name, part.kind, values, seen, "\n".join(places)])
     headings = ["disturbance", "kind", "values", "seen", "disturbs"]
     return text_table("", headings, rows, text=["disturbance", "kind", "seen", "disturbs"])
 

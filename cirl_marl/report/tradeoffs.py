@@ -39,22 +39,18 @@ def comparison_table(comparison: Comparison) -> Table:
 
 def worst_table(comparison: Comparison) -> Table:
     """One row a recipe or controller: what is expected of each service, and the 5 % worst episodes of each figure."""
-    rows = [
-        [name, *cells] for name, cells in zip([row.name for row in comparison.rows], _worst(comparison), strict=True)
-    ]
+    rows = [[row.name, *cells] for row, cells in zip(comparison.rows, _worst(comparison), strict=True)]
     title = "expected, and mean of the 5 % worst episodes of each figure by itself; 95 % intervals in brackets"
     return text_table(title, ["policy", *_worst_headers(comparison)], rows, text=["policy"])
 
 
 def worst_notes(comparison: Comparison) -> list[str]:
     """Return the rows of ``worst_table`` as sentences, without intervals."""
-    heads = _worst_headers(comparison)
-    return [
-        f"{row.name}: "
-        + ", ".join(f"{head} {cell.splitlines()[0]}" for head, cell in zip(heads, cells, strict=True))
-        + "."
-        for row, cells in zip(comparison.rows, _worst(comparison), strict=True)
-    ]
+    notes = []
+    for row, cells in zip(comparison.rows, _worst(comparison), strict=True):
+        figures = zip(_worst_headers(comparison), cells, strict=True)
+        notes.append(f"{row.name}: {', '.join(f'{head} {cell.splitlines()[0]}' for head, cell in figures)}.")
+    return notes
 
 
 def _worst_headers(comparison: Comparison) -> list[str]:
@@ -65,37 +61,29 @@ def _worst_headers(comparison: Comparison) -> list[str]:
 
 def _worst(comparison: Comparison) -> list[list[str]]:
     """Return the cells of each row, in the order of ``_worst_headers``."""
-    forms = ["{:.4f}"] * len(comparison.network.services)
-    forms = [*forms, FORMS[0], *forms]
-    return [
-        [_interval(figure, form) for figure, form in zip([*row.levels(), *row.worst()], forms, strict=True)]
-        for row in comparison.rows
-    ]
+    levels = ["{:.4f}"] * len(comparison.network.services)
+    forms = [*levels, FORMS[0], *levels]
+    return [[*map(_interval, [*row.levels(), *row.worst()], forms)] for row in comparison.rows]
 
 
 def comparison_notes(comparison: Comparison) -> list[str]:
     """Return what the reader of a comparison's table has to know."""
     notes, baseline = [], comparison.baseline
     if comparison.ties is not None:
-        reason = (
-            f"episodes: {comparison.episodes}, doubled from {EPISODES_DISTURBED} to at most {MOST_EPISODES:,} while"
-        )
-        notes.append(f"{reason} the interval of a difference between two rows is wider than the difference")
+        count = f"{comparison.episodes}, doubled from {EPISODES_DISTURBED} to at most {MOST_EPISODES:,}"
+        reason = "the interval of a difference between two rows is wider than the difference"
+        notes.append(f"episodes: {count} while {reason}")
     if comparison.ties:
         notes.append(f"not told apart: {', '.join(comparison.ties)}")
     if any(row.seeds for row in comparison.rows):
-        notes.append(
-            "trained: interquartile mean over training seeds, bootstrap over seeds; controllers: mean over episodes, "
-            "Student's t"
-        )
+        trained = "interquartile mean over training seeds, bootstrap over seeds"
+        notes.append(f"trained: {trained}; controllers: mean over episodes, Student's t")
     if any(row.has_few_seeds for row in comparison.rows):
         notes.append(f"few: fewer than {ENOUGH_SEEDS} training seeds; the interval says little, one seed has none")
     if comparison.entries[0].bound is not None:
         foresight = "" if baseline.envelope is not None else ", whatever anybody knew of what was drawn,"
-        notes.append(
-            f"bound: no episode from the same start with at least the same level of each service{foresight} has a"
-            " higher λ̄"
-        )
+        episode = f"episode from the same start with at least the same level of each service{foresight}"
+        notes.append(f"bound: no {episode} has a higher λ̄")
     elif baseline.reason:
         notes.append(f"gap to bound: {baseline.reason}")
         if any(row.name == "optimum" for row in comparison.rows):
@@ -112,14 +100,10 @@ def _interval(aggregate: Aggregate | None, form: str) -> str:
 
 def save_comparison(path: str | Path, comparison: Comparison, *, title: str = "") -> Path:
     """Save where each policy and controller of a comparison is, training seed by training seed."""
-    series = [
-        PointSeries(
-            row.name,
-            np.array([entry.rollout.least_service.mean() for entry in row.entries]),
-            np.array([entry.circularity.mean() for entry in row.entries]),
-        )
-        for row in comparison.rows
-    ]
+    series = []
+    for row in comparison.rows:
+        service = np.array([entry.rollout.least_service.mean() for entry in row.entries])
+        series.append(PointSeries(row.name, service, np.array([entry.circularity.mean() for entry in row.entries])))
     title = title or f"{comparison.network.title or comparison.network.name}: {comparison.episodes} episodes"
     return save_fronts(path, comparison.network, series, comparison.baseline.front, title=title)
 

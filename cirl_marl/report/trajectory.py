@@ -73,11 +73,8 @@ def ages_table(network: Network, of_ages: Sequence[Pyramid]) -> tuple[list[str],
     for pyramid in of_ages:
         edges = (pyramid.interval * np.arange(pyramid.mass.shape[1] + 1)).tolist()
         for time_cells, masses in zip(clock, pyramid.mass.tolist(), strict=True):
-            rows += [
-                [*time_cells, pyramid.node, edges[i], edges[i + 1], amount]
-                for i, amount in enumerate(masses)
-                if amount > 0
-            ]
+            classes = zip(edges[:-1], edges[1:], masses, strict=True)
+            rows += [[*time_cells, pyramid.node, *cells] for cells in classes if cells[-1] > 0]
     return header, rows
 
 
