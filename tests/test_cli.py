@@ -99,7 +99,7 @@ def test_check_tells_how_far_it_is(monkeypatch: pytest.MonkeyPatch, capsys: pyte
     def bar(what: str) -> Iterator[Callable[[float], None]]:
         yield told.append
 
-    monkeypatch.setattr(cli.networks, "bar", bar)
+    monkeypatch.setattr(cli.common, "bar", bar)
     assert run(monkeypatch, "check", "bottles.toml", "wrong.toml") == 2
     assert told == [0.25, 0.5, 0.5, 1.0]  # two scenarios, then the file, then the one that cannot be read
     assert "no mistakes" in capsys.readouterr().out
@@ -649,7 +649,7 @@ def test_plan_shows_how_far_the_search_is(monkeypatch: pytest.MonkeyPatch) -> No
     def bar(what: str) -> Iterator[Callable[[float], None]]:
         yield shares.append
 
-    monkeypatch.setattr("cirl_marl.cli.episodes.bar", bar)
+    monkeypatch.setattr("cirl_marl.cli.common.bar", bar)
     monkeypatch.setattr("cirl_marl.optimum.mpc.search_each", partial(search_each, population=8, iterations=2))
     text = (folder("envs") / "net_zero.toml").read_text(encoding="utf-8")
     Path("short.toml").write_text(text.replace("horizon = { value = 120", "horizon = { value = 24"), encoding="utf-8")

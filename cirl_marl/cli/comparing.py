@@ -9,48 +9,33 @@ from typing import Annotated, Any
 import typer
 
 from cirl_marl.cli import common
-from cirl_marl.cli.common import (
-    COMPARISONS,
-    CONTROLLERS,
-    EpisodeCount,
-    Html,
-    MinService,
-    NetworkName,
-    Scenario,
-    Seed,
-    Uncertain,
-    app,
-    console,
-    say,
-    shares,
-)
 from cirl_marl.errors import CirlError
 from cirl_marl.jobs import PLACES
 
 
-@app.command(rich_help_panel=COMPARISONS)
+@common.app.command(rich_help_panel=common.COMPARISONS)
 def compare(
     runs: Annotated[
         list[Path] | None, typer.Argument(metavar="RUN...", help="Training runs of one environment; may be left out.")
     ] = None,
     controllers: Annotated[
-        str, typer.Option(help=f"Comma-separated, of {CONTROLLERS}; neutral is always there.")
+        str, typer.Option(help=f"Comma-separated, of {common.CONTROLLERS}; neutral is always there.")
     ] = "neutral,random",
     network: Annotated[
         str | None,
         typer.Option(help="Catalogue name, FILE.toml or FILE.toml:REGION; default: the network of the runs."),
     ] = None,
-    scenario: Scenario = None,
+    scenario: common.Scenario = None,
     episodes: Annotated[
         int | None, typer.Option(min=2, help="Fresh episodes; default: 16, or of a disturbed network 256 to 1024.")
     ] = None,
-    seed: Seed = 0,
-    min_service: MinService = None,
-    uncertain: Uncertain = None,
+    seed: common.Seed = 0,
+    min_service: common.MinService = None,
+    uncertain: common.Uncertain = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for episodes.csv, summary.csv, summary.json and comparison.png.")
     ] = None,
-    html: Html = None,
+    html: common.Html = None,
 ) -> None:
     """Compare trained runs and controllers on the same fresh episodes, and with the best possible.
 
@@ -66,16 +51,16 @@ def compare(
     folder, page = None if out is None else common.folder_for(out, "--out"), common.page_for(html)
     episodes = _enough(16, network, scenario, runs or []) if episodes is None else episodes
     options: dict[str, Any] = {"episodes": episodes, "seed": seed, "min_service": min_service, "uncertain": uncertain}
-    with shares() as progress:
+    with common.shares() as progress:
         comparison = compared(runs or [], names, network=network, scenario=scenario, progress=progress, **options)
-    console.print(comparison_table(comparison))
+    common.console.print(comparison_table(comparison))
     if comparison.network.disturbed:
-        console.print(worst_table(comparison))
+        common.console.print(worst_table(comparison))
     for note in comparison_notes(comparison):
-        say(note)
+        common.say(note)
     files = [] if folder is None else write_comparison(comparison, folder, controllers=names, **options)
     for path in [*files, *common.browser_report(page, comparison)]:
-        say(f"wrote {path}")
+        common.say(f"wrote {path}")
 
 
 def _enough(certain: int, network: str | None, scenario: str | None, runs: Sequence[Path]) -> int | None:
@@ -89,9 +74,9 @@ def _enough(certain: int, network: str | None, scenario: str | None, runs: Seque
     return None if definition.disturbed else certain
 
 
-@app.command(rich_help_panel=COMPARISONS)
+@common.app.command(rich_help_panel=common.COMPARISONS)
 def pareto(
-    network: NetworkName,
+    network: common.NetworkName,
     recipe: Annotated[
         str | None, typer.Option(help="Learner recipe to train with several weights; default: bound and plans only.")
     ] = None,
@@ -100,15 +85,15 @@ def pareto(
     steps: Annotated[
         int | None, typer.Option(min=1, help="Environment steps of each training; default: the recipe's.")
     ] = None,
-    episodes: EpisodeCount = 16,
-    scenario: Scenario = None,
+    episodes: common.EpisodeCount = 16,
+    scenario: common.Scenario = None,
     on: Annotated[str, typer.Option(help=f"Where learners are trained: {', '.join(PLACES)}.")] = "here",
     workers: Annotated[int | None, typer.Option(min=1, help="Trainings at a time; default: all that can be.")] = None,
     out: Annotated[
         Path | None,
         typer.Option(help="Folder of pareto.csv, .json, .png and the runs; default: runs/pareto-NETWORK[_SCENARIO]."),
     ] = None,
-    html: Html = None,
+    html: common.Html = None,
 ) -> None:
     """Draw service against circularity: what is possible, what plans achieve, what learners reach.
 
@@ -120,34 +105,35 @@ def pareto(
     from cirl_marl.report.tradeoffs import write_front
 
     page = common.page_for(html)
-    folder = common.folder_for(
-        out or Path("runs") / f"pareto-{common.stem(load_network(network, scenario=scenario))}", "--out"
-    )
+    stem = common.stem(load_network(network, scenario=scenario))
+    folder = common.folder_for(out or Path("runs") / f"pareto-{stem}", "--out")
     options: dict[str, Any] = {"points": points, "seeds": seeds, "steps": steps, "episodes": episodes}
     try:
-        with shares() as progress:
+        with common.shares() as progress:
             place: dict[str, Any] = {"directory": folder, "on": on, "workers": workers}
             front = swept(network, recipe, scenario=scenario, progress=progress, **place, **options)
     except KeyboardInterrupt:
-        say(f"\nstopped; finished trainings are kept in {folder}. The same command goes on.")
+        common.say(f"\nstopped; finished trainings are kept in {folder}. The same command goes on.")
         raise typer.Exit(130) from None
     for kind in ("bound", "plan", "trained", "neutral"):
         for point in front.of(kind):
             about = "" if point.weight is None else f"  (weight {point.weight:.3g}, seed {point.seed})"
-            say(f"{kind:8} service {point.service:.4f}  λ̄ {point.circularity:.5g} {front.network.mass_unit}{about}")
+            common.say(
+                f"{kind:8} service {point.service:.4f}  λ̄ {point.circularity:.5g} {front.network.mass_unit}{about}"
+            )
     if front.reason:
-        say(f"no bound: {front.reason}")
+        common.say(f"no bound: {front.reason}")
     for path in [*write_front(front, folder, recipe=recipe, **options), *common.browser_report(page, front)]:
-        say(f"wrote {path}")
+        common.say(f"wrote {path}")
 
 
-@app.command(rich_help_panel=COMPARISONS)
+@common.app.command(rich_help_panel=common.COMPARISONS)
 def levers(
-    network: NetworkName,
+    network: common.NetworkName,
     group: Annotated[
         list[str] | None, typer.Option(help="Agents that are one lever: NAME=AGENT,AGENT,…; may be repeated.")
     ] = None,
-    scenario: Scenario = None,
+    scenario: common.Scenario = None,
     min_service: Annotated[
         float | None,
         typer.Option(min=0.0, max=1.0, help="Mean level of each service; default: what there is as usual."),
@@ -172,11 +158,11 @@ def levers(
     variant = load_network(network, scenario=scenario)
     folder = common.folder_for(out or Path("runs") / f"levers-{common.stem(variant)}", "--out")
     options: dict[str, Any] = {"groups": groups, "min_service": min_service, "bounds": bounds}
-    with shares() as progress:
+    with common.shares() as progress:
         result = levers_of(variant, progress=progress, **options)
-    console.print(levers_table(result))
+    common.console.print(levers_table(result))
     for path in write_levers(result, folder, **options):
-        say(f"wrote {path}")
+        common.say(f"wrote {path}")
 
 
 def _group(text: str) -> tuple[str, list[str]]:

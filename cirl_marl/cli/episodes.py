@@ -8,35 +8,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cirl_marl.cli.common import (
-    CONTROLLERS,
-    EPISODES,
-    EpisodeSeed,
-    Html,
-    MinService,
-    NetworkName,
-    Scenario,
-    app,
-    bar,
-    browser_report,
-    console,
-    folder_for,
-    page_for,
-    say,
-    stem,
-)
+from cirl_marl.cli import common
 from cirl_marl.errors import CirlError
 
 if TYPE_CHECKING:
     from cirl_marl.evaluation.simulations import Simulation
 
 
-@app.command(rich_help_panel=EPISODES)
+@common.app.command(rich_help_panel=common.EPISODES)
 def simulate(
-    network: NetworkName,
+    network: common.NetworkName,
     control: Annotated[
         list[str] | None,
-        typer.Option(help=f"Who acts: {CONTROLLERS}; repeat it to compare several; default: neutral."),
+        typer.Option(help=f"Who acts: {common.CONTROLLERS}; repeat it to compare several; default: neutral."),
     ] = None,
     set_: Annotated[
         list[str] | None,
@@ -45,7 +29,7 @@ def simulate(
         ),
     ] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Control intervals; default: the horizon.")] = None,
-    seed: EpisodeSeed = None,
+    seed: common.EpisodeSeed = None,
     scenario: Annotated[
         list[str] | None,
         typer.Option(help="Scenario of the definition; repeat it to compare several; default: the physical one."),
@@ -54,7 +38,7 @@ def simulate(
         int | None, typer.Option(min=2, help="Draws of what is uncertain or disturbed, for bands and what causes them.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Directory of CSV and picture; default: here.")] = None,
-    html: Html = None,
+    html: common.Html = None,
 ) -> None:
     """Simulate a network under a controller without learning; write a CSV and a picture.
 
@@ -66,14 +50,14 @@ def simulate(
     With --samples uncertain numbers and disturbances are drawn so many times: bands in a CSV and a picture.
     From 70 samples on a table says which number causes most of the spread.
     """
-    controls, page = control or ["neutral"], page_for(html)
+    controls, page = control or ["neutral"], common.page_for(html)
     if samples is not None:
         _sample(network, scenario or [None], controls, steps, 0 if seed is None else seed, samples, out, page)
         return
     from cirl_marl.evaluation.simulations import simulate_alternatives
 
-    constants, folder = _constants(controls, set_ or []), folder_for(out or Path(), "--out")
-    with bar("simulating") as progress:
+    constants, folder = _constants(controls, set_ or []), common.folder_for(out or Path(), "--out")
+    with common.bar("simulating") as progress:
         found = simulate_alternatives(
             network,
             scenarios=scenario or [None],
@@ -83,13 +67,13 @@ def simulate(
             seed=seed,
             progress=progress,
         )
-    files = {stem(simulation.network, simulation.control): simulation for simulation in found}
+    files = {common.stem(simulation.network, simulation.control): simulation for simulation in found}
     if len(found) == 1:
         _write_one(folder, files)
     else:
         _write_several(folder, files)
-    for path in browser_report(page, found):
-        say(f"wrote {path}")
+    for path in common.browser_report(page, found):
+        common.say(f"wrote {path}")
 
 
 def _sample(
@@ -111,16 +95,16 @@ def _sample(
 
     if len(scenarios) > 1 or len(controls) > 1:
         raise CirlError("--samples goes with one scenario and one control; compare their files")
-    folder, network = folder_for(out or Path(), "--out"), load_network(name, scenario=scenarios[0])
+    folder, network = common.folder_for(out or Path(), "--out"), load_network(name, scenario=scenarios[0])
     if steps is not None:
         network = network.with_options(episode={"horizon": steps})
     if samples >= FEWEST and network.uncertain:
         rbd_fast()  # or an error, before anything is simulated
-    with bar("sampling") as progress:
+    with common.bar("sampling") as progress:
         episodes = sample_episodes(network, samples=samples, control=controls[0], seed=seed, progress=progress)
     causes = sensitivities(episodes) if samples >= FEWEST else []
     title = f"{network.title or network.name}, {controls[0]} control, {samples} samples"
-    paths = write_samples(folder, stem(network, controls[0]), episodes, causes, title=title)
+    paths = write_samples(folder, common.stem(network, controls[0]), episodes, causes, title=title)
     # a few bad samples draw the mean out of the interval, so that the median stands beside it
     figures = [("λ̄", f" {network.mass_unit}", ".5g", episodes.circularity.mean(axis=1))]
     levels = zip(network.services, episodes.levels.mean(axis=2).T, strict=True)
@@ -128,17 +112,17 @@ def _sample(
     for name, unit, form, values in figures:
         low, median, high = np.quantile(values, (0.025, 0.5, 0.975)).tolist()
         spread = f"median {median:{form}}{unit}, 95 % of samples in [{low:{form}}, {high:{form}}]"
-        say(f"{name}: {spread}; mean {values.mean():{form}}{unit}")
+        common.say(f"{name}: {spread}; mean {values.mean():{form}}{unit}")
     if causes:
-        console.print(sensitivity_table(episodes, causes))
+        common.console.print(sensitivity_table(episodes, causes))
     elif network.uncertain:
-        say(f"which number causes the spread is told from {FEWEST} samples on")
+        common.say(f"which number causes the spread is told from {FEWEST} samples on")
     if page is not None:
         from cirl_marl.report.page_html import write_page
         from cirl_marl.report.report_page import page_of_samples
 
         paths.append(write_page(page, page_of_samples(episodes, controls[0])))
-    say(f"wrote {', '.join(map(str, paths))}")
+    common.say(f"wrote {', '.join(map(str, paths))}")
 
 
 def _write_one(folder: Path, files: Mapping[str, Simulation]) -> None:
@@ -148,7 +132,7 @@ def _write_one(folder: Path, files: Mapping[str, Simulation]) -> None:
     title = f"{only.network.title or only.network.name}, {only.control} control"
     paths = write_trajectory(folder, name, only, title)
     _say_lines(str(only))
-    say(f"wrote {', '.join(map(str, paths))}")
+    common.say(f"wrote {', '.join(map(str, paths))}")
 
 
 def _write_several(folder: Path, files: Mapping[str, Simulation]) -> None:
@@ -164,33 +148,33 @@ def _write_several(folder: Path, files: Mapping[str, Simulation]) -> None:
     for simulation in simulations:
         _say_lines(str(simulation), f"{simulation.name}: ")
     if unequal := [simulation for simulation in quantities if simulation.rank > 0]:
-        console.print(differences_table(simulations, unequal))
+        common.console.print(differences_table(simulations, unequal))
     more = f", of which {ROWS} are shown" if len(unequal) > ROWS else ""
-    say(f"{len(unequal)} of {len(quantities)} quantities differ{more}; all are in {paths[-2]}")
+    common.say(f"{len(unequal)} of {len(quantities)} quantities differ{more}; all are in {paths[-2]}")
     for path in paths:
-        say(f"wrote {path}")
+        common.say(f"wrote {path}")
 
 
-@app.command(rich_help_panel=EPISODES)
+@common.app.command(rich_help_panel=common.EPISODES)
 def plan(
     source: Annotated[
         str, typer.Argument(metavar="RUN | NETWORK", help="Training run; or with --control a network, as elsewhere.")
     ],
     control: Annotated[
-        str | None, typer.Option(help=f"Who acts in a network: {CONTROLLERS}; a run acts by its policies.")
+        str | None, typer.Option(help=f"Who acts in a network: {common.CONTROLLERS}; a run acts by its policies.")
     ] = None,
     out: Annotated[
         Path | None,
         typer.Option(help="CSV file to write; default: plan_NETWORK[_SCENARIO]_CONTROL or plan_RUN."),
     ] = None,
-    scenario: Scenario = None,
-    seed: EpisodeSeed = None,
-    min_service: MinService = None,
+    scenario: common.Scenario = None,
+    seed: common.EpisodeSeed = None,
+    min_service: common.MinService = None,
     smooth: Annotated[
         bool | None,
         typer.Option(help="Of optimum's plans of equal worth the one with least change; default: unless it is large."),
     ] = None,
-    html: Html = None,
+    html: common.Html = None,
 ) -> None:
     """Write what a policy or controller does in one episode, beside business as usual, and what that saves.
 
@@ -205,8 +189,8 @@ def plan(
 
     if out is not None and out.suffix != ".csv":
         raise CirlError(f"--out {out}: needs the name of a .csv file")
-    page = page_for(html)
-    with bar("planning") as progress:
+    page = common.page_for(html)
+    with common.bar("planning") as progress:
         schedule = plans.plan(
             source,
             control,
@@ -217,28 +201,26 @@ def plan(
             progress=progress,
         )
     network = schedule.network
-    stem_of_file = Path(source).resolve().name if control is None else stem(network, control)
+    stem_of_file = Path(source).resolve().name if control is None else common.stem(network, control)
     path = Path(f"plan_{stem_of_file}.csv") if out is None else out
     path.parent.mkdir(parents=True, exist_ok=True)
     schedule.write(path)
     beside = write_decisions(path, schedule, title=f"{network.title or network.name}: {control or 'what was learnt'}")
     if path.with_suffix(".xlsx") not in beside:
-        say(NO_WORKBOOK)
-    beside += browser_report(page, schedule)
-    console.print(decisions_table(schedule))
-    console.print(savings_table(schedule))
+        common.say(NO_WORKBOOK)
+    beside += common.browser_report(page, schedule)
+    common.console.print(decisions_table(schedule))
+    common.console.print(savings_table(schedule))
     _say_lines(str(schedule))
-    say(f"wrote {', '.join(map(str, (path, *beside)))}")
+    common.say(f"wrote {', '.join(map(str, (path, *beside)))}")
 
 
 def _say_lines(text: str, prefix: str = "") -> None:
-    """Print the lines of a text; ``prefix`` goes first in each."""
     for line in text.splitlines():
-        say(prefix + line)
+        common.say(prefix + line)
 
 
 def _constants(controls: Sequence[str], settings: list[str]) -> dict[str, float]:
-    """Return the values of --set by agent."""
     from cirl_marl.optimum.registry import SETTABLE
 
     if settings and not set(controls) & set(SETTABLE):

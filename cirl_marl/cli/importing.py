@@ -124,7 +124,6 @@ ANSWERS |= {role: role for role in ("landfill", "incinerator", "environment")}
 
 
 def _ask(name: str, kind: str) -> Role:
-    """Ask what a source or a sink is."""
     from cirl_marl.network.elements import Role
 
     choices = ", ".join(ANSWERS)

@@ -8,24 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cirl_marl.cli.common import (
-    LEARNERS,
-    OBSERVE,
-    REWARDS,
-    EpisodesOfRun,
-    Html,
-    RunPath,
-    Scenario,
-    Seed,
-    Uncertain,
-    app,
-    comma_separated,
-    console,
-    page_for,
-    say,
-    shares,
-    training_bar,
-)
+from cirl_marl.cli import common
 from cirl_marl.errors import CirlError
 from cirl_marl.jobs import PLACES, JobStatus, run_jobs
 
@@ -37,7 +20,7 @@ if TYPE_CHECKING:
     from cirl_marl.paper.results import PaperRow, Results
 
 
-@app.command(rich_help_panel=LEARNERS)
+@common.app.command(rich_help_panel=common.LEARNERS)
 def train(
     context: typer.Context,
     network: Annotated[
@@ -59,16 +42,16 @@ def train(
         ),
     ] = None,
     device: Annotated[str, typer.Option(help="Where stacked learners compute: cpu, cuda, …")] = "cpu",
-    seed: Seed = 0,
+    seed: common.Seed = 0,
     seeds: Annotated[
         int, typer.Option(min=1, help="So many runs together, of this seed and the next ones, in OUT-seedN.")
     ] = 1,
-    scenario: Scenario = None,
-    reward: Annotated[str | None, typer.Option(help=f"{REWARDS}; default: the recipe's.")] = None,
+    scenario: common.Scenario = None,
+    reward: Annotated[str | None, typer.Option(help=f"{common.REWARDS}; default: the recipe's.")] = None,
     observe: Annotated[
-        str | None, typer.Option(help=f"{OBSERVE}; default: the recipe's, else the definition's.")
+        str | None, typer.Option(help=f"{common.OBSERVE}; default: the recipe's, else the definition's.")
     ] = None,
-    uncertain: Uncertain = None,
+    uncertain: common.Uncertain = None,
     out: Annotated[Path | None, typer.Option(help="Run directory; default: runs/NETWORK-RECIPE-seedN.")] = None,
     resume: Annotated[
         Path | None, typer.Option(metavar="RUN", help="Go on with an interrupted run; with --steps, to so many.")
@@ -76,7 +59,7 @@ def train(
     checkpoint_every: Annotated[
         float | None, typer.Option(min=0, help="Seconds between checkpoints; 0: none by time.", show_default="60")
     ] = None,
-    episodes: EpisodesOfRun = None,
+    episodes: common.EpisodesOfRun = None,
 ) -> None:
     """Train one learner per compartment, all at once, then evaluate them and draw what changed.
 
@@ -92,10 +75,14 @@ def train(
         _only_resume(context)
     options: dict[str, Any] = {"steps": steps, "envs": envs, "scenario": scenario, "reward": reward, "engine": engine}
     options |= {"min_service": min_service, "uncertain": uncertain, "checkpoint_every": checkpoint_every}
-    options |= {"observe": observe, "agents": None if agents is None else comma_separated(agents), "device": device}
+    options |= {
+        "observe": observe,
+        "agents": None if agents is None else common.comma_separated(agents),
+        "device": device,
+    }
     all_seeds = range(seed, seed + seeds)
     directories = [resume] if resume is not None else _directories(out, str(network), recipe, all_seeds)
-    with training_bar() as report:
+    with common.training_bar() as report:
         options["report"] = report
         try:
             if resume is not None:
@@ -108,22 +95,21 @@ def train(
                 interface.train(str(network), recipe, seed=seed, directory=directories[0], **options)
         except KeyboardInterrupt:
             for directory in directories:
-                console.print(f"\nstopped; {what_is_kept(directory)}", soft_wrap=True, highlight=False)
+                common.console.print(f"\nstopped; {what_is_kept(directory)}", soft_wrap=True, highlight=False)
             raise typer.Exit(130) from None
     for directory in directories:
         evaluate_and_draw(directory, episodes, 0)
 
 
 def _directories(out: Path | None, network: str, recipe: str, seeds: Sequence[int]) -> list[Path]:
-    """Return where the runs are kept."""
     from cirl_marl.definitions.catalogue import load_network
 
     parent = out or Path("runs") / f"{load_network(network).name}-{Path(recipe).stem}"
     return [out] if out is not None and len(seeds) == 1 else [Path(f"{parent}-seed{seed}") for seed in seeds]
 
 
-@app.command(rich_help_panel=LEARNERS)
-def evaluate(run: RunPath, episodes: EpisodesOfRun = None, seed: Seed = 0) -> None:
+@common.app.command(rich_help_panel=common.LEARNERS)
+def evaluate(run: common.RunPath, episodes: common.EpisodesOfRun = None, seed: common.Seed = 0) -> None:
     """Compare the trained policies with neutral and random control on fresh seeds, and with the best possible.
 
     The gap is to an upper bound, which no episode from the same start that serves at least as well exceeds.
@@ -131,39 +117,42 @@ def evaluate(run: RunPath, episodes: EpisodesOfRun = None, seed: Seed = 0) -> No
     from cirl_marl.evaluation import assessment
     from cirl_marl.report.terminal import local_returns_table
 
-    with shares() as progress:
+    with common.shares() as progress:
         evaluation = assessment.evaluate(run, episodes=episodes, seed=seed, progress=progress)
     figures = evaluation.figures
     _write_figures(evaluation)
     _print_tables(evaluation)
-    console.print(local_returns_table(figures))
-    say(assessment.acting_checkpoint(evaluation.run))
+    common.console.print(local_returns_table(figures))
+    common.say(assessment.acting_checkpoint(evaluation.run))
     _say_lacking(evaluation)
     if "no_bound" in figures:
-        say(f"gap to bound: {figures['no_bound']}")
+        common.say(f"gap to bound: {figures['no_bound']}")
 
 
-@app.command(rich_help_panel=LEARNERS)
+@common.app.command(rich_help_panel=common.LEARNERS)
 def export(
-    run: RunPath, out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")]
+    run: common.RunPath,
+    out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")],
 ) -> None:
     """Write the trained policies as files that Stable-Baselines3 loads; this library itself never reads such files."""
     from cirl_marl.learners import interface
 
     for path in interface.export(run, out):
-        say(f"{path}")
+        common.say(f"{path}")
 
 
-@app.command(rich_help_panel=LEARNERS)
-def report(run: RunPath, episodes: EpisodesOfRun = None, seed: Seed = 0, html: Html = None) -> None:
+@common.app.command(rich_help_panel=common.LEARNERS)
+def report(
+    run: common.RunPath, episodes: common.EpisodesOfRun = None, seed: common.Seed = 0, html: common.Html = None
+) -> None:
     """Evaluate a run and draw its pictures anew.
 
     With --html the policies stand beside business as usual and the plan of the bound: as long as ``cirl evaluate``.
     """
-    evaluate_and_draw(run, episodes, seed, page_for(html))
+    evaluate_and_draw(run, episodes, seed, common.page_for(html))
 
 
-@app.command(rich_help_panel=LEARNERS)
+@common.app.command(rich_help_panel=common.LEARNERS)
 def paper(
     environment: Annotated[str | None, typer.Argument(metavar="ENV", help="Such as CopperNet; default: all.")] = None,
     algorithm: Annotated[str | None, typer.Argument(metavar="ALGORITHM", help="Such as A2C; default: all.")] = None,
@@ -196,21 +185,21 @@ def paper(
     results.prepare()
     reasons = {row: reason_to_repeat(results.read(row), episodes) for row in rows if results.has(row)}
     rest = [row for row in rows if row not in reasons or reasons[row]]
-    say(f"{overview(rows, rest)}; results in {results.path}")
+    common.say(f"{overview(rows, rest)}; results in {results.path}")
     for row in rows:
         if reasons.get(row):
-            say(f"{row}: once more, as {reasons[row]}")
+            common.say(f"{row}: once more, as {reasons[row]}")
         elif row in reasons:
-            say(result_line(results.read(row)))
+            common.say(result_line(results.read(row)))
     try:
         has_failures = _run_rows(rest, results, episodes, on, workers)
     except KeyboardInterrupt:
-        say(f"\nstopped; finished rows are kept in {out}. The same command goes on.")
+        common.say(f"\nstopped; finished rows are kept in {out}. The same command goes on.")
         raise typer.Exit(130) from None
     results_on_disk, requests = results.read_all(), {_request(row) for row in rows}
     for environment_data in environments:
         fit = [result for result in results_on_disk if result.row in rows or _request(result.row) not in requests]
-        console.print(environment_table(environment_data, fit))
+        common.console.print(environment_table(environment_data, fit))
     if has_failures:
         raise typer.Exit(1)
 
@@ -226,13 +215,13 @@ def _run_rows(rows: Sequence[PaperRow], results: Results, episodes: int | None, 
 
     jobs = {row.stem: RowJob(row, results.path, episodes) for row in rows}
     names_shown: set[str] = set()
-    with shares() as progress:
+    with common.shares() as progress:
 
         def watch(statuses: Sequence[JobStatus]) -> None:
             for status in statuses:
                 if status.state == "done" and status.name not in names_shown:
                     names_shown.add(status.name)
-                    say(result_line(results.read(jobs[status.name].row)))
+                    common.say(result_line(results.read(jobs[status.name].row)))
                 elif status.state == "running":
                     place = f"{len(names_shown) + 1} of {len(rows)}"
                     progress(f"{place}: {jobs[status.name].row}: {status.figures.get('what', '')}", status.share)
@@ -240,19 +229,15 @@ def _run_rows(rows: Sequence[PaperRow], results: Results, episodes: int | None, 
         failures = run_jobs([*jobs.values()], results.path / "logs", on=on, workers=workers, watch=watch)
     for failure in failures:
         message = failure.error if isinstance(failure.error, CirlError) else failure.message
-        say(f"{jobs[failure.name].row}: failed: {message}")
+        common.say(f"{jobs[failure.name].row}: failed: {message}")
     return bool(failures)
 
 
 def _only_resume(context: typer.Context) -> None:
     """Refuse options beside --resume: a resumed run keeps its own."""
-    surplus = [
-        f"--{name}"
-        for name in context.params
-        if name not in ("resume", "network", "episodes", "steps", "device", "checkpoint_every")
-        and getattr(context.get_parameter_source(name), "name", "DEFAULT") != "DEFAULT"
-    ]
-    if surplus:
+    exceptions = ("resume", "network", "episodes", "steps", "device", "checkpoint_every")
+    sources = {name: context.get_parameter_source(name) for name in context.params if name not in exceptions}
+    if surplus := [f"--{name}" for name, source in sources.items() if getattr(source, "name", "DEFAULT") != "DEFAULT"]:
         raise CirlError(f"--resume goes on with the run as it was configured; leave out {', '.join(surplus)}")
 
 
@@ -274,7 +259,7 @@ def _write_figures(evaluation: Evaluation) -> None:
     try:
         evaluation.write()
     except OSError as error:
-        say(f"evaluation.json could not be written: {error}")
+        common.say(f"evaluation.json could not be written: {error}")
 
 
 def _say_lacking(evaluation: Evaluation) -> None:
@@ -283,17 +268,16 @@ def _say_lacking(evaluation: Evaluation) -> None:
 
     for name, rollout in evaluation.rollouts.items():
         for line in shortage_lines(evaluation.env.network, rollout):
-            say(f"{name}: {line}")
+            common.say(f"{name}: {line}")
 
 
 def _print_tables(evaluation: Evaluation) -> None:
-    """Print the figures of an evaluation, of a disturbed network the worst episodes too."""
     from cirl_marl.report.terminal import evaluation_table
     from cirl_marl.report.tradeoffs import worst_table
 
-    console.print(evaluation_table(evaluation.figures))
+    common.console.print(evaluation_table(evaluation.figures))
     if evaluation.comparison.network.disturbed:
-        console.print(worst_table(evaluation.comparison))
+        common.console.print(worst_table(evaluation.comparison))
 
 
 def evaluate_and_draw(directory: Path, episodes: int | None, seed: int, page: Path | None = None) -> None:
@@ -304,7 +288,7 @@ def evaluate_and_draw(directory: Path, episodes: int | None, seed: int, page: Pa
     from cirl_marl.report.report_page import PLAN, page_of_evaluation
 
     share = 1.0 if page is None else EVALUATION_SHARE
-    with shares() as progress:
+    with common.shares() as progress:
         evaluation = assessment.evaluate(
             directory,
             episodes=episodes,
@@ -315,16 +299,16 @@ def evaluate_and_draw(directory: Path, episodes: int | None, seed: int, page: Pa
         story = None if page is None else page_of_evaluation(evaluation, part_of(progress, PLAN, share, 1 - share))
     _write_figures(evaluation)
     _print_tables(evaluation)
-    say(assessment.acting_checkpoint(evaluation.run))
+    common.say(assessment.acting_checkpoint(evaluation.run))
     _say_lacking(evaluation)
     for path in draw_run(evaluation):
-        say(f"picture: {path}")
+        common.say(f"picture: {path}")
     if page is not None and story is not None:
         from cirl_marl.report.page_html import write_page
 
-        say(f"wrote {write_page(page, story)}")
+        common.say(f"wrote {write_page(page, story)}")
     run = evaluation.run
     if not run.metrics()["env_steps"]:
         minimum = run.config.envs * evaluation.env.network.episode.horizon
-        say(f"no learning curves, as no episode ended: {run.config.envs} copies need {minimum:,} steps")
-    say(f"run: {directory}  (figures in evaluation.json; gap to the bound and more: cirl evaluate {directory})")
+        common.say(f"no learning curves, as no episode ended: {run.config.envs} copies need {minimum:,} steps")
+    common.say(f"run: {directory}  (figures in evaluation.json; gap to the bound and more: cirl evaluate {directory})")

@@ -3,25 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cirl_marl.cli.common import (
-    NETWORKS,
-    EpisodeSeed,
-    NetworkName,
-    Scenario,
-    app,
-    bar,
-    console,
-    errors,
-    plain,
-    say,
-    stem,
-)
+from cirl_marl.cli import common
 from cirl_marl.errors import CirlError
 
 if TYPE_CHECKING:
@@ -29,7 +16,7 @@ if TYPE_CHECKING:
     from cirl_marl.network import Network
 
 
-@app.command("networks", rich_help_panel=NETWORKS)
+@common.app.command("networks", rich_help_panel=common.NETWORKS)
 def list_networks(
     every_region: Annotated[
         bool, typer.Option("--all", help="A row for each region of a definition that has regions.")
@@ -39,11 +26,11 @@ def list_networks(
     from cirl_marl.definitions.catalogue import definitions, recipes
     from cirl_marl.report.terminal import networks_table
 
-    console.print(networks_table(definitions(), all_regions=every_region))
-    console.print(f"recipes for --recipe: {', '.join(recipes())}")
+    common.console.print(networks_table(definitions(), all_regions=every_region))
+    common.console.print(f"recipes for --recipe: {', '.join(recipes())}")
 
 
-@app.command(rich_help_panel=NETWORKS)
+@common.app.command(rich_help_panel=common.NETWORKS)
 def new(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="The definition to write, such as my.toml.")],
     material: Annotated[str, typer.Option(prompt="Which material", help="What flows.")],
@@ -88,7 +75,7 @@ def new(
         products=products,
     )
     write_first(first, file)
-    say(f"wrote {file}; next: cirl plan {file} --control optimum --min-service 1, and cirl train {file}")
+    common.say(f"wrote {file}; next: cirl plan {file} --control optimum --min-service 1, and cirl train {file}")
 
 
 def _product(text: str) -> tuple[str, tuple[float, float]]:
@@ -101,11 +88,11 @@ def _product(text: str) -> tuple[str, tuple[float, float]]:
     return name.strip(), (in_use, lifetime)
 
 
-@app.command(rich_help_panel=NETWORKS)
+@common.app.command(rich_help_panel=common.NETWORKS)
 def show(
-    network: NetworkName,
-    scenario: Scenario = None,
-    seed: EpisodeSeed = None,
+    network: common.NetworkName,
+    scenario: common.Scenario = None,
+    seed: common.EpisodeSeed = None,
     picture: Annotated[
         Path | None, typer.Option(help="Where to draw it; default: NETWORK[_SCENARIO].png here.")
     ] = None,
@@ -130,29 +117,29 @@ def show(
     start.reset(env)
     stock, flow = env.rows.stocks(env.physical.stock)[:, 0], env.physical.flow[:, 0]
     folded_view = fold_copies(definition, stock, flow, unfold or ())
-    console.print(nodes_table(folded_view[0], folded_view[1]))
-    console.print(arcs_table(folded_view[0], folded_view[2]))
+    common.console.print(nodes_table(folded_view[0], folded_view[1]))
+    common.console.print(arcs_table(folded_view[0], folded_view[2]))
     for service in definition.services:
         ends = [f"at least {service.low:g}"] if extremes(service.low)[1] > 0 else []
         ends += [] if np.isinf(extremes(service.high)[0]) else [f"at most {service.high:g}"]
         variation = ", changing in time" if isinstance(service.low, Series) or isinstance(service.high, Series) else ""
         subject = f"{service.measure or service.quantity} of {' and '.join(service.providers)}"
-        console.print(f"service '{service.id}': {subject} {' and '.join(ends)}{variation}")
+        common.console.print(f"service '{service.id}': {subject} {' and '.join(ends)}{variation}")
     if definition.disturbed:
-        console.print(disturbances_table(definition))
+        common.console.print(disturbances_table(definition))
     circularity = float(definition.circularity(flow))
-    console.print(f"λ of the start state: {circularity:.5g} {definition.mass_unit}")
-    say(f"start: {start.description}")
-    path = picture or Path(f"{stem(definition)}.png")
+    common.console.print(f"λ of the start state: {circularity:.5g} {definition.mass_unit}")
+    common.say(f"start: {start.description}")
+    path = picture or Path(f"{common.stem(definition)}.png")
     if path.suffix != ".png":
         raise CirlError(f"--picture {path}: needs the name of a .png file")
     save_network(
         path, definition, stock, flow, title=definition.title, circularity=circularity, open_copies=unfold or ()
     )
-    console.print(f"picture: {path}")
+    common.console.print(f"picture: {path}")
 
 
-@app.command(rich_help_panel=NETWORKS)
+@common.app.command(rich_help_panel=common.NETWORKS)
 def check(
     sources: Annotated[
         list[str], typer.Argument(metavar="FILE...", help="Networks and recipes: files, or names of the catalogue.")
@@ -166,26 +153,21 @@ def check(
     What is no mistake but seldom meant is said as a remark. Nothing is trained.
     """
     faulty, names = False, [name for argument in sources for name in _with_regions(argument)]
-    with bar("checking") as progress:
+    with common.bar("checking") as progress:
         for i, source in enumerate(names):
             try:
                 if _is_recipe(source):
                     _check_recipe(source, network)
                 elif network is None:
-                    _check_network(source, partial(_part, progress, i, len(names)))
+                    _check_network(source, progress, i, len(names))
                 else:
                     raise CirlError(f"check {source}: is no recipe; --network names the network that recipes must fit")
             except CirlError as error:
                 faulty = True
-                errors.print(plain(error), highlight=False, soft_wrap=True)
+                common.errors.print(common.plain(error), highlight=False, soft_wrap=True)
             progress((i + 1) / len(names))
     if faulty:
         raise typer.Exit(2)
-
-
-def _part(progress: Callable[[float], None], place: int, count: int, share: float) -> None:
-    """Tell how far all is when one of several is done to a share."""
-    progress((place + share) / count)
 
 
 def _with_regions(source: str) -> list[str]:
@@ -218,9 +200,11 @@ def _check_recipe(source: str, network: str | None) -> None:
     idle = [] if network is None else _idle_matches(source, recipe, load_network(network))
     algorithms = ", ".join(dict.fromkeys(learner.algorithm for _, learner in recipe.learners()))
     fit = "" if network is None else f", in {network}"
-    say(f"{source}: recipe of {algorithms}, {recipe.run.steps:,} steps in {recipe.run.envs} copies{fit}: no mistakes")
+    common.say(
+        f"{source}: recipe of {algorithms}, {recipe.run.steps:,} steps in {recipe.run.envs} copies{fit}: no mistakes"
+    )
     for match in idle:
-        say(f"{source}: remark on {network}: nobody learns by {match}")
+        common.say(f"{source}: remark on {network}: nobody learns by {match}")
 
 
 def _idle_matches(source: str, recipe: Recipe, network: Network) -> list[str]:
@@ -235,7 +219,7 @@ def _idle_matches(source: str, recipe: Recipe, network: Network) -> list[str]:
     return [match for match, learner in recipe.learners()[1:] if id(learner) not in busy]
 
 
-def _check_network(source: str, progress: Callable[[float], None]) -> None:
+def _check_network(source: str, progress: Callable[[float], None], place: int, count: int) -> None:
     from cirl_marl.controllers.lint import lint_warnings
     from cirl_marl.definitions.catalogue import definition, load_network
     from cirl_marl.environments.vector import MultiAgentVectorEnv
@@ -250,10 +234,10 @@ def _check_network(source: str, progress: Callable[[float], None]) -> None:
         except CirlError as error:
             raise CirlError(f"{source}, scenario '{variant.scenario_name}': {error}") from error
         remarks += (f"scenario '{variant.scenario_name}': {remark}" for remark in lint_warnings(variant, env))
-        progress(i / (1 + len(network.scenarios)))
-    say(
+        progress((place + i / (1 + len(network.scenarios))) / count)
+    common.say(
         f"{source}: {len(network.compartments)} compartments, {len(network.agents)} agents, "
         f"scenarios {', '.join([network.scenario_name, *network.scenarios])}: no mistakes"
     )
     for remark in remarks:
-        say(f"{source}: remark on {remark}")
+        common.say(f"{source}: remark on {remark}")

@@ -85,7 +85,6 @@ def sweep(
 
 
 def _settings(assignments: Sequence[str]) -> dict[str, str]:
-    """Return settings by name."""
     for assignment in assignments:
         if "=" not in assignment:
             raise CirlError(f"--slurm {assignment}: must be NAME=VALUE, such as partition=long")
@@ -115,10 +114,8 @@ def _live(on_stderr: bool) -> Iterator[Callable[[Sequence[CellStatus]], None]]:
             name, state = cell.job_status.name, cell.job_status.state
             if before.setdefault(name, "waiting") != state:
                 before[name] = state
-                line = f"{state}: {name}" + (
-                    f", gap {cell.gap:.1%}" if state == "done" and cell.gap is not None else ""
-                )
-                printer.print(line, soft_wrap=True, highlight=False, markup=False)
+                gap = "" if state != "done" or cell.gap is None else f", gap {cell.gap:.1%}"
+                printer.print(f"{state}: {name}{gap}", soft_wrap=True, highlight=False, markup=False)
 
     yield tell
 
@@ -178,10 +175,8 @@ def _results(rows: Sequence[Mapping[str, Any]]) -> Table:
 
     identity = ("network", "scenario", "recipe", "seed")
     recipes = {row["recipe"] for row in rows}
-    columns = [
-        *identity,
-        *(key for key in OPTION_COLUMNS if len({(row["recipe"], row[key]) for row in rows}) > len(recipes)),
-    ]
+    options = [key for key in OPTION_COLUMNS if len({(row["recipe"], row[key]) for row in rows}) > len(recipes)]
+    columns = [*identity, *options]
     table = Table(*columns, "λ̄", "service", "gap to the bound")
     for row in rows:
         figures = (("circularity", "{:.5g}"), ("service", "{:.4f}"), ("gap", "{:.1%}"))

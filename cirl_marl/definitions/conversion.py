@@ -81,9 +81,7 @@ class Converter:
         parts: dict[str, Any] = {
             "nodes": tuple(self._compartment(Node, id_, node, f"nodes.{id_}") for id_, node in table.nodes.items()),
             "arcs": tuple(self._compartment(Arc, id_, arc, f"arcs.{id_}") for id_, arc in table.arcs.items()),
-            "services": tuple(
-                self._part(elements.Service, service, f"services.{id_}", id=id_) for id_, service in services
-            ),
+            "services": tuple(self._part(elements.Service, part, f"services.{id_}", id=id_) for id_, part in services),
             "episode": self._part(elements.Episode, table.episode, "episode"),
             "objective": self._part(elements.Objective, table.objective, "objective"),
             "observation": self._part(elements.Observation, table.observation, "observation"),
@@ -160,7 +158,6 @@ class Converter:
         return tuple(entry) if isinstance(entry, list) else entry
 
     def _record(self, entry: RecordColumn, path: str) -> tuple[float, ...]:
-        """Return the numbers of a column of a file as they stand there."""
         texts = {key: self._with_region(text, f"{path}.where.{key}") for key, text in entry.where.items()}
         try:
             column = self.files.column(entry.file, entry.column, texts, entry.times)
@@ -223,18 +220,14 @@ class Converter:
         with_range = model.ranged_states
         for name in (*table.initial, *with_range):
             if name not in with_range or name not in table.initial:
-                without_range = [state for state in with_range if state not in table.initial]
-                faults = (
-                    f"'{name}' is missing" if name in with_range else unknown_name("inner state", name, without_range)
-                )
-                self.mistakes.append(f"{path}.initial: {faults}")
+                options = [state for state in with_range if state not in table.initial]
+                fault = f"'{name}' is missing" if name in with_range else unknown_name("inner state", name, options)
+                self.mistakes.append(f"{path}.initial: {fault}")
         ranges = [table.initial[name] for name in with_range if name in table.initial]
-        scale = table.reward_scale
-        return {
-            "model": model,
-            "inner": tuple((span.low, span.high) for span in ranges),
-            "reward_scale": 1.0 if scale is None else self._value(scale, "1", f"{path}.reward_scale"),
-        }
+        fields: dict[str, Any] = {"model": model, "inner": tuple((span.low, span.high) for span in ranges)}
+        if table.reward_scale is not None:
+            fields["reward_scale"] = self._value(table.reward_scale, "1", f"{path}.reward_scale")
+        return fields
 
     def _control(self, control: Any, model: CompartmentModel | None, path: str) -> Control | None:
         path = f"{path}.control"
@@ -248,9 +241,8 @@ class Converter:
             self.mistakes.append(f"{path}: {fault}; {remedy}")
             return None
         unit = self._factor(control.unit, target or "1", path)
-        sides = {
-            side: self._in_time(getattr(control, side), unit, f"{path}.{side}") for side in ("low", "neutral", "high")
-        }
+        ends = ("low", "neutral", "high")
+        sides = {side: self._in_time(getattr(control, side), unit, f"{path}.{side}") for side in ends}
         self._disturb(control, control.unit, target or "1", f"{path}.high")
         result = Control(kind=control.kind, **sides)
         self._spread(control, result.nominal, unit, path)
@@ -260,7 +252,6 @@ class Converter:
         return result
 
     def _number(self, quantity: Any, kind: str, path: str) -> float:
-        """Return a quantity that does not change in time."""
         value = self._value(quantity, kind, path)
         if isinstance(value, Series):
             self.mistakes.append(f"{path}: {CONSTANT}")
@@ -275,9 +266,8 @@ class Converter:
                 if getattr(multiplier, key) is not None:
                     self.mistakes.append(f"{path}.multiplied_by.{key}: belongs beside it, to the product")
             if multiplier.multiplied_by is not None:
-                self.mistakes.append(
-                    f"{path}.multiplied_by.multiplied_by: a quantity has one factor; multiply the others"
-                )
+                fault = "a quantity has one factor; multiply the others"
+                self.mistakes.append(f"{path}.multiplied_by.multiplied_by: {fault}")
         unit = self._factor(name, kind, path)
         value = self._in_time(quantity, unit, path)
         self._spread(quantity, value, unit, path)
@@ -314,9 +304,8 @@ class Converter:
         name = quantity.disturbed_by
         if name is None:
             if quantity.disturbed_as is not None:
-                self.mistakes.append(
-                    f"{path}.disturbed_as: '{quantity.disturbed_as}' needs disturbed_by, a disturbance"
-                )
+                fault = f"'{quantity.disturbed_as}' needs disturbed_by, a disturbance"
+                self.mistakes.append(f"{path}.disturbed_as: {fault}")
             return
         adds, scale, own = quantity.disturbed_as == "summand", 1.0, self.table.disturbances.get(name)
         if adds and own is not None:
@@ -346,7 +335,6 @@ class Converter:
         return column
 
     def _with_region(self, text: str, path: str) -> str:
-        """Return a text of the file with that of the region in its place."""
         if REGION in text and not self.region:
             self.mistakes.append(f"{path}: '{text}': a definition without [regions] has no {REGION}")
         return text.replace(REGION, self.table.regions.get(self.region, ""))

@@ -229,10 +229,9 @@ class _Table:
         if times is not None:
             return Column(self._times(matches, times), values, origin)
         if len(matches) > 1:
+            first, second, *_ = (self.lines[i] for i in matches)
             remedy = "fix more columns in 'where', or name the column of times in 'times'"
-            raise CirlError(
-                f"{origin}: lines {self.lines[matches[0]]} and {self.lines[matches[1]]} both match; {remedy}"
-            )
+            raise CirlError(f"{origin}: lines {first} and {second} both match; {remedy}")
         return Column(None, values, origin)
 
     def _matching_rows(self, conditions: Mapping[str, str]) -> list[int]:

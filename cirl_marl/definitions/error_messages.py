@@ -66,13 +66,10 @@ def validation_mistakes(error: ValidationError, model: type[BaseModel]) -> list[
 
 
 def _mistake(item: Mapping[str, Any], model: type[BaseModel]) -> str:
-    location = [str(part) for part in item["loc"] if part != "[key]"]
-    path = "".join(
-        f", entry {part + 1}" if isinstance(part, int) else f".{part}"
-        for part in item["loc"]
-        if part != "[key]" and not (isinstance(part, str) and part.startswith("<"))
-    ).lstrip(".,")
-    path = path or "file"
+    parts = [part for part in item["loc"] if part != "[key]"]
+    location = [str(part) for part in parts]
+    keys = [part for part in parts if not str(part).startswith("<")]
+    path = "".join(f", entry {key + 1}" if isinstance(key, int) else f".{key}" for key in keys).lstrip(".,") or "file"
     if item["type"] == "extra_forbidden" and location[::2] == ["arcs", "series"]:
         return f"{path}: write flow = {{ times = […], values = […], time_unit = …, unit = …, source = … }}"
     if item["type"] == "extra_forbidden" and location[-1] in ("disturbed_by", "disturbed_as"):

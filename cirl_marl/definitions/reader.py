@@ -58,9 +58,8 @@ class Definition:
         if not isinstance(overrides, dict) or not all(isinstance(scenario, dict) for scenario in overrides.values()):
             raise DefinitionError(str(path), ["scenarios: must be tables, as in [scenarios.paper]"])
         if DEFAULT in overrides:
-            raise DefinitionError(
-                str(path), ["scenarios.default: the default scenario is what stands outside [scenarios]"]
-            )
+            fault = "the default scenario is what stands outside [scenarios]"
+            raise DefinitionError(str(path), [f"scenarios.default: {fault}"])
         self._overrides = {DEFAULT: {}, **overrides}
         self.names = tuple(self._overrides)
         self.regions = self._document.get("regions", {})
@@ -77,31 +76,21 @@ class Definition:
         """
         if region not in (self.regions or [""]):
             example = f"as in {self.path.name}:{next(iter(self.regions), 'japan')}"
-            question = f"which region? Known: {', '.join(self.regions)}. Write it after a colon, {example}"
-            raise DefinitionError(
-                str(self.path), [unknown_name("region", region, self.regions) if region else question]
-            )
+            fault = f"which region? Known: {', '.join(self.regions)}. Write it after a colon, {example}"
+            fault = unknown_name("region", region, self.regions) if region else fault
+            raise DefinitionError(str(self.path), [fault])
+        fields: dict[str, Any] = {"scenario_name": name, "scenarios": _OtherScenarios(self, name, region)}
         if (name, region) not in self._networks and name != DEFAULT and not self._changes(name):
-            like = self.network(DEFAULT, region)
-            self._networks[name, region] = replace(
-                like, scenario_name=name, scenarios=_OtherScenarios(self, name, region)
-            )
+            self._networks[name, region] = replace(self.network(DEFAULT, region), **fields)
         if (name, region) not in self._networks:
             override, prefix = self._overrides[name], "" if name == DEFAULT else f"scenarios.{name}."
             document, copies = self._whole(name)
             mistakes = list(_strangers(document, override, prefix))
             if mistakes:
                 raise DefinitionError(str(self.path), mistakes)
+            fields |= {"copies": copies, "source": self.path, "source_sha256": self.sha256}
             try:
-                self._networks[name, region] = _build(
-                    self._under(name, document),
-                    (self.files, region),
-                    copies=copies,
-                    scenario_name=name,
-                    scenarios=_OtherScenarios(self, name, region),
-                    source=self.path,
-                    source_sha256=self.sha256,
-                )
+                self._networks[name, region] = _build(self._under(name, document), (self.files, region), **fields)
             except NetworkError as error:
                 raise DefinitionError(str(self.path), [prefix + problem for problem in error.problems]) from None
         return self._networks[name, region]

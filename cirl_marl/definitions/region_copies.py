@@ -61,11 +61,7 @@ def compose_copies(
         raise NetworkError(table.of, forms)
     pattern = _pattern(document, original, scenario)
     document_ = {k: dict(v) if isinstance(v, Mapping) else v for k, v in document.items() if k != "scenarios"}
-    mistakes = [
-        f"copies.regions: {unknown_name('region', region_id, texts)}"
-        for region_id in table.regions
-        if region_id not in texts
-    ]
+    mistakes = [f"copies.regions: {unknown_name('region', id_, texts)}" for id_ in table.regions if id_ not in texts]
     nodes: dict[str, tuple[str, ...]] = {}
     regions = [] if mistakes else table.regions or [*texts]
     if regions:
@@ -92,18 +88,12 @@ def _table(entries: Any, path: str, kind: type[BaseModel] = CopiesTable) -> Any:
 
 
 def _pattern(document: Document, original: Document, scenario: str) -> dict[str, Any]:
-    """Return what is copied, under a scenario."""
     of = document["copies"]["of"]
     changes = [("copies.", {key: value for key, value in document["copies"].items() if key not in ("of", "regions")})]
     changes.append((f"{of}: scenarios.{scenario}.", original.get("scenarios", {}).get(scenario, {})))
     changes_here = document.get("scenarios", {}).get(scenario, {}).get("copies", {})
-    faults = [
-        f"scenarios.{scenario}.copies.{key}: a scenario cannot set it"
-        for key in ("of", "regions")
-        if key in changes_here
-    ]
-    if faults:
-        raise NetworkError(of, faults)
+    if keys := [key for key in ("of", "regions") if key in changes_here]:
+        raise NetworkError(of, [f"scenarios.{scenario}.copies.{key}: a scenario cannot set it" for key in keys])
     _table({"of": of, **changes_here}, f"scenarios.{scenario}.copies")
     changes.append((f"scenarios.{scenario}.copies.", changes_here))
     pattern, removals = dict(original), set[str]()
@@ -146,10 +136,9 @@ def _add_common(document: dict[str, Any], pattern: dict[str, Any], regions: Sequ
     table: Any = _table(entries, "disturbance_correlation", CorrelationTable)
     count, between = len(table.names), 0.0 if table.regions is None else table.regions.value
     if len(table.matrix) != count or {*map(len, table.matrix)} != {count} or "disturbance_correlation" in document:
-        fault = (
-            f"needs a matrix of {count} rows of {count} numbers, and stands there or in the definition copied, not both"
-        )
-        raise NetworkError("copies", [f"disturbance_correlation: {fault}"])
+        fault = f"needs a matrix of {count} rows of {count} numbers"
+        place = "stands there or in the definition copied, not both"
+        raise NetworkError("copies", [f"disturbance_correlation: {fault}, and {place}"])
     places = [(region, i) for region in regions for i in range(count) if table.names[i] not in common]
     places += [("", i) for i in range(count) if table.names[i] in common]
     document["disturbance_correlation"] = {
@@ -197,7 +186,6 @@ def _with_disturbances(value: Any, region: str, disturbances: Document) -> Any:
 
 
 def _with_region(value: Any, text: str) -> Any:
-    """Return a copy of a table with the text of the region in its place."""
     if isinstance(value, Mapping):
         return {key: _with_region(entry, text) for key, entry in value.items()}
     if isinstance(value, list):

@@ -93,16 +93,9 @@ class ModelTable(Table):
 def table_of(record: type[Any], **more: Any) -> Any:
     """Return the table of a part: a key for each declared field, with ``more`` that Python has otherwise."""
     fields, hints = declarations(record), get_type_hints(record)
-    unspelt = [
-        n
-        for n, declaration in fields.items()
-        if isinstance(declaration, Numbers) and not declaration.table_form and n not in IN_MODEL
-    ]
-    if unspelt:
+    if unspelt := [n for n, d in fields.items() if isinstance(d, Numbers) and not d.table_form and n not in IN_MODEL]:
         raise TypeError(f"{record.__name__}: numbers need a spelling in definition files: {', '.join(unspelt)}")
-    types = {
-        name: _field_type(declaration, hints[name]) for name, declaration in fields.items() if name not in IN_MODEL
-    }
+    types = {name: _field_type(field, hints[name]) for name, field in fields.items() if name not in IN_MODEL}
     keys = {name: _key(record, name, kind) for name, kind in types.items() if kind is not None}
     of_table = any(isinstance(declaration, Quantity) and declaration.unit_of_table for declaration in fields.values())
     if of_table or VaryingAmount in types.values():
@@ -167,17 +160,11 @@ _OF_CONTROL = {
     "what is drawn multiplies all three values",
     "range": "lowest and highest neutral value that it may have; of a share at most 1",
 }
-_STATED = {
-    name: StatedTable.model_fields[name]
-    for name in ("disturbed_by", "disturbed_as", "deviation", "range", "distribution")
-}
-ControlTable = table_of(
-    Control,
-    **{
-        name: (stated.annotation, Field(None, description=_OF_CONTROL.get(name, stated.description)))
-        for name, stated in _STATED.items()
-    },
-)
+_STATED: dict[str, Any] = {}
+for _name in ("disturbed_by", "disturbed_as", "deviation", "range", "distribution"):
+    _stated = StatedTable.model_fields[_name]
+    _STATED[_name] = (_stated.annotation, Field(None, description=_OF_CONTROL.get(_name, _stated.description)))
+ControlTable = table_of(Control, **_STATED)
 LifetimeTable = table_of(Lifetime)
 RuleTable = table_of(FeedbackRule)
 NodeTable = table_of(Node)

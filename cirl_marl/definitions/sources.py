@@ -34,9 +34,8 @@ def stated_numbers(network: Network) -> Mapping[str, Mapping[str, tuple[StatedNu
         DefinitionError: if the file has changed since the network was read from it.
     """
     document = _document(network)
-    return {
-        table: {id_: tuple(_numbers_in(part, "")) for id_, part in document.get(table, {}).items()} for table in TABLES
-    }
+    parts = {table: document.get(table, {}).items() for table in TABLES}
+    return {table: {id_: tuple(_numbers_in(part, "")) for id_, part in rows} for table, rows in parts.items()}
 
 
 def stated_settings(network: Network) -> tuple[StatedNumber, ...]:

@@ -140,18 +140,12 @@ def _products(cycle: FirstCycle) -> Iterator[dict[str, Any]]:
 
 def _market(products: list[dict[str, Any]], flow: float) -> str:
     """Return the market that shares out what is recycled, in proportion to what goes into each use."""
-    shares = [
-        f'{{ value = {product["flow"] / flow:.6g}, unit = "1", source = "part of what goes into use" }}'
-        for product in products
-    ]
-    shares[-1] = '"rest"'
-    market = (
-        '[nodes.market]                # shares out what is recycled; extraction makes up behind it\ntitle = "Market"\n'
-    )
-    market += 'role = "technosphere"\nstores = false\n'
-    for product, share in zip(products, shares, strict=True):
-        suffix = product["suffix"]
-        market += (
-            f'\n[arcs.recycled{suffix}]\nfrom = "market"\nto = "production{suffix}"\nlaw = "share"\nshare = {share}\n'
-        )
+    market = "[nodes.market]                # shares out what is recycled; extraction makes up behind it\n"
+    market += 'title = "Market"\nrole = "technosphere"\nstores = false\n'
+    for product in products:
+        part, suffix = product["flow"] / flow, product["suffix"]
+        share = f'{{ value = {part:.6g}, unit = "1", source = "part of what goes into use" }}'
+        share = '"rest"' if product is products[-1] else share
+        market += f'\n[arcs.recycled{suffix}]\nfrom = "market"\nto = "production{suffix}"\n'
+        market += f'law = "share"\nshare = {share}\n'
     return market

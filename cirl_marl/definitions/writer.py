@@ -102,7 +102,6 @@ class _Writer:
         }
 
     def _disturbances(self) -> dict[str, Any]:
-        """Return the tables of what disturbs it, if anything does."""
         network = self._network
         tables: dict[str, Any] = {}
         if network.disturbances:
@@ -115,7 +114,6 @@ class _Writer:
         return tables
 
     def _disturbance_keys(self, path: str) -> dict[str, Any]:
-        """Return the keys that say what disturbs a number."""
         disturbed = self._network.disturbed.get(path)
         if disturbed is None:
             return {}
@@ -209,7 +207,6 @@ class _Writer:
 
 
 def _spread_keys(spread: Spread | None, value: Value) -> dict[str, Any]:
-    """Return the keys that say how a number spreads."""
     if spread is None:
         return {}
     middle = float(np.mean(value.values)) if isinstance(value, Series) else value

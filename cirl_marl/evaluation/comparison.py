@@ -74,21 +74,14 @@ class Entry:
     @property
     def expected_gap(self) -> Floats | None:
         """(bound for who does not foresee − λ̄ − Σ_s μ_s (level_s − demand_s))/scale, shape (episodes,)."""
-        return (
-            None
-            if self.uncertain_bound is None
-            else self.uncertain_bound.gaps(self.circularity, self.rollout.episode_levels)
-        )
+        bound = self.uncertain_bound
+        return None if bound is None else bound.gaps(self.circularity, self.rollout.episode_levels)
 
     @property
     def foresight_gap(self) -> Floats | None:
         """The same, held against who knows the future of each episode."""
-        levels = self.rollout.episode_levels
-        return (
-            None
-            if self.uncertain_bound is None
-            else self.uncertain_bound.gaps(self.circularity, levels, with_foresight=True)
-        )
+        bound, levels = self.uncertain_bound, self.rollout.episode_levels
+        return None if bound is None else bound.gaps(self.circularity, levels, with_foresight=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,13 +200,8 @@ def compare(
 
     run_directories = [run if isinstance(run, RunDirectory) else RunDirectory(run) for run in runs]
     controls = controllers if "neutral" in controllers else ["neutral", *controllers]
-    candidates, env = contenders(
-        run_directories,
-        controls,
-        None if definition is None else definition.scenario(scenario),
-        min_service,
-        uncertain,
-    )
+    variant = None if definition is None else definition.scenario(scenario)
+    candidates, env = contenders(run_directories, controls, variant, min_service, uncertain)
     if uncertain_bound is not None:
         episodes, seed = _check_draws(uncertain_bound, env, episodes, seed), uncertain_bound.sampling.seed
     adapts, first = episodes is None and bool(env.network.disturbed), first_seed(seed)
@@ -238,18 +226,13 @@ def compare(
         except NoCertificate as missing:
             report(1.0)
             baseline = Baseline(reason=str(missing))
-    neutral = next(
-        run
-        for candidate, run in zip(candidates, rollouts, strict=True)
-        if candidate.run is None and candidate.name == "neutral"
-    )
-    entries = tuple(
-        Entry(
-            candidate.name, candidate.seed, candidate.run, checkpoint, run, gain(run, neutral), bound, uncertain_bound
-        )
-        for candidate, checkpoint, run, bound in zip(candidates, checkpoints, rollouts, bounds_by_entry, strict=True)
-    )
-    return Comparison(env.network, env.agents, first, entries, baseline, unclear if adapts else None)
+    rows = [*zip(candidates, checkpoints, rollouts, bounds_by_entry, strict=True)]
+    neutral = next(run for candidate, _, run, _ in rows if candidate.run is None and candidate.name == "neutral")
+    entries = []
+    for candidate, checkpoint, run, bound in rows:
+        training = candidate.name, candidate.seed, candidate.run, checkpoint
+        entries.append(Entry(*training, run, gain(run, neutral), bound, uncertain_bound))
+    return Comparison(env.network, env.agents, first, tuple(entries), baseline, unclear if adapts else None)
 
 
 def _check_draws(bound_: UncertainBound, env: MultiAgentVectorEnv, episodes: int | None, seed: int) -> int:

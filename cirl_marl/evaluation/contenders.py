@@ -85,11 +85,7 @@ def differences(env: MultiAgentVectorEnv, reference_env: MultiAgentVectorEnv) ->
         words = ("drawn", "not drawn") if env.uncertain else ("not drawn", "drawn")
         yield f"uncertain numbers {words[0]}, there {words[1]}; say which with uncertain"
     physics, reference = _physics(own_network), _physics(reference_network)
-    changes = [
-        f"{quantity} {physics[quantity]!r}, not {reference[quantity]!r}"
-        for quantity in physics
-        if physics[quantity] != reference[quantity]
-    ]
+    changes = [f"{key} {physics[key]!r}, not {reference[key]!r}" for key in physics if physics[key] != reference[key]]
     parts, counterparts = _parts(own_network), _parts(reference_network)
     ids = [f"'{key[1]}'" for key in parts | counterparts if parts.get(key) != counterparts.get(key)]
     if ids:
@@ -113,9 +109,7 @@ def _physics(network: Network) -> dict[str, Any]:
 
 def _parts(network: Network) -> dict[tuple[str, str], object]:
     """Return compartments, services, which may share ids, and what disturbs numbers, by what they are and their id."""
-    parts: dict[tuple[str, str], object] = {
-        ("compartment", id_): compartment for id_, compartment in network.compartments.items()
-    }
+    parts: dict[tuple[str, str], object] = {("compartment", id_): part for id_, part in network.compartments.items()}
     parts |= {("service", service.id): service for service in network.services}
     effects = network.disturbed.items()
     parts |= {("disturbance", path): (effect, network.disturbances[effect.by]) for path, effect in effects}

@@ -180,13 +180,11 @@ class _Trials:
         return self._bound(part.agents).objective if self._solves else self._worth(simulate_plan(part))
 
     def _bound(self, agents: tuple[str, ...]) -> Bound:
-        """Return the bound while only these agents act."""
         if agents not in self._bounds:
             self._bounds[agents] = bound(self._plan.network, min_service=self._plan.min_service, agents=agents)
         return self._bounds[agents]
 
     def _part_of_plan(self, names: Iterable[str]) -> Bound:
-        """Return the plan of all with these levers alone."""
         chosen = {agent for name in names for agent in self._by_lever[name]}
         agents = tuple(agent for agent in self._plan.agents if agent in chosen)
         columns = [entry for agent in agents for entry in range(*self._entries[agent].indices(2**31))]
@@ -201,7 +199,6 @@ class _Trials:
 
 
 def _as_usual(network: Network) -> Rollout:
-    """Return the episode in which nobody acts."""
     env = MultiAgentVectorEnv(network, num_envs=1)
     begin = episode_start(env)
     return rollout(env, Neutral(), seed=begin.seed, start=begin.initial_state)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -172,15 +172,9 @@ class _TrainingJob:
         """Train, or go on training."""
         from cirl_marl.learners.interface import complete_run  # it needs torch
 
-        complete_run(
-            self.directory.path,
-            self.network,
-            self.recipe,
-            report=lambda now: tell("training", now.env_steps, max(now.total, 1)),
-            steps=self.steps,
-            seed=self.seed,
-            circularity_weight=self.weight,
-        )
+        options: dict[str, Any] = {"steps": self.steps, "seed": self.seed, "circularity_weight": self.weight}
+        options["report"] = lambda now: tell("training", now.env_steps, max(now.total, 1))
+        complete_run(self.directory.path, self.network, self.recipe, **options)
 
     def check(self) -> None:
         """Refuse a run that is there and answers another question."""
@@ -212,9 +206,8 @@ def _env(network: Network, recipe: Recipe) -> MultiAgentVectorEnv:
 def _check_fit(network: Network, recipe: Recipe) -> None:
     scenario = recipe.environment.get("scenario", network.scenario_name)
     if scenario != network.scenario_name:
-        raise CirlError(
-            f"recipe '{recipe.name}' is for scenario '{scenario}', the sweep for '{network.scenario_name}': ask for one"
-        )
+        other = f"the sweep for '{network.scenario_name}': ask for one"
+        raise CirlError(f"recipe '{recipe.name}' is for scenario '{scenario}', {other}")
     env = _env(network, recipe)
     recipe.check_agents(env.agents)
     if env.reward_mode not in WEIGHTED_REWARDS:
@@ -235,9 +228,8 @@ def _possible(network: Network, points: int, progress: ProgressReport) -> tuple[
         solution = bound(network, min_service=level, near=bounds[-1] if bounds else None)
         bounds.append(solution)
         results.append(Point(kind="bound", service=level, circularity=solution.objective))
-        episode = simulate_plan(
-            improve_plan(solution, progress=part_of(progress, "bounds and plans", place / points, 1 / points))
-        )
+        report = part_of(progress, "bounds and plans", place / points, 1 / points)
+        episode = simulate_plan(improve_plan(solution, progress=report))
         service, circularity = float(episode.least_service[0]), float(episode.episode_circularity[0])
         results.append(Point(kind="plan", service=service, circularity=circularity))
         progress("bounds and plans", (place + 1) / points)
@@ -252,7 +244,6 @@ def _levels(least: float, most: float, points: int) -> list[float]:
 
 
 def _policy_points(runs: Sequence[RunDirectory], episodes: int) -> Iterator[Point]:
-    """Yield where the policies are, and neutral control."""
     for entry in compare(runs, ["neutral"], episodes=episodes, bounds=False).entries:
         yield Point(
             kind="neutral" if entry.run is None else "trained",

@@ -93,7 +93,6 @@ def _environment_and_controller(
     min_service: ArrayLike | None,
     smooth: bool | None,
 ) -> tuple[MultiAgentVectorEnv, Controller]:
-    """Return one copy of the environment, and who acts in it."""
     run = _run_of(source)
     if control is not None:
         if isinstance(source, RunDirectory) or (run is not None and (run.path / "config.json").is_file()):

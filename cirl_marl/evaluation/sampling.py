@@ -112,18 +112,15 @@ def sensitivities(episodes: SampledEpisodes) -> list[Sensitivity]:
     if count < FEWEST:
         raise CirlError(f"{count} samples are too few to tell which number matters; take {FEWEST} or more")
     # it takes the order of the draws alone
-    problem = {
-        "num_vars": len(episodes.names),
-        "names": list(episodes.names),
-        "bounds": [[0.0, 1.0]] * len(episodes.names),
-    }
+    numbers = len(episodes.names)
+    problem = {"num_vars": numbers, "names": list(episodes.names), "bounds": [[0.0, 1.0]] * numbers}
     figures = {"λ̄": episodes.circularity.mean(axis=1)}
     levels = episodes.levels.mean(axis=2)
     figures |= {f"level of {service.id}": levels[:, s] for s, service in enumerate(episodes.network.services)}
     causes = []
     for name, values in figures.items():
         if np.ptp(values) <= 1e-12 * np.abs(values).max(initial=0.0):
-            no_share = np.full(len(episodes.names), np.nan)
+            no_share = np.full(numbers, np.nan)
             causes.append(Sensitivity(name, no_share, no_share))
             continue
         indices = analysis.analyze(problem, episodes.factors, values, num_resamples=RESAMPLES, seed=0)

@@ -54,16 +54,8 @@ class Simulation:
         lambdas = (run.circularity[0], run.circularity_mean[0])
         flows = (*run.flow.T, *env.network.throughput(run.flow.T))
         ages = [pyramid.mean_age for pyramid in pyramids(env.network, run, run.start)]
-        columns = (
-            *lambdas,
-            run.service[0],
-            *run.stock.T,
-            *flows,
-            *run.load.T,
-            *run.inner.T,
-            *(age[1:] for age in ages),
-            *run.disturbances[0].T,
-        )
+        insides = (*run.load.T, *run.inner.T, *(age[1:] for age in ages), *run.disturbances[0].T)
+        columns = (*lambdas, run.service[0], *run.stock.T, *flows, *insides)
         states = [*run.start_load.tolist(), *run.start_inner.tolist(), *(float(age[0]) for age in ages)]
         states += [None] * run.disturbances.shape[2]
         first = [*[None] * 3, *run.start.tolist(), *[None] * len(flows), *states]
@@ -217,9 +209,8 @@ def _refuse(
     for env in envs[1:]:
         if obstacles := list(_obstacles(envs[0].network, env.network)):
             pair = f"'{envs[0].network.scenario_name}' and '{env.network.scenario_name}'"
-            raise CirlError(
-                f"network '{env.network.name}': scenarios {pair} cannot be compared: {'; '.join(obstacles)}"
-            )
+            name = env.network.name
+            raise CirlError(f"network '{name}': scenarios {pair} cannot be compared: {'; '.join(obstacles)}")
 
 
 def _tell(progress: Callable[[float], None], done: int, of: int, share: float) -> None:
@@ -230,11 +221,9 @@ def _tell(progress: Callable[[float], None], done: int, of: int, share: float) -
 def _obstacles(first: Network, second: Network) -> Iterator[str]:
     """Yield what keeps episodes of two scenarios from being compared, with the values of both."""
     units = {"mass": (first.mass_unit, second.mass_unit), "time": (first.time_unit, second.time_unit)}
-    yield from (
-        f"unit of {quantity} {value_1} and {value_2}"
-        for quantity, (value_1, value_2) in units.items()
-        if value_1 != value_2
-    )
+    for quantity, (value_1, value_2) in units.items():
+        if value_1 != value_2:
+            yield f"unit of {quantity} {value_1} and {value_2}"
     if first.time_unit != second.time_unit:
         return  # times would differ even where they are the same
     intervals = (first.objective.reference_interval, second.objective.reference_interval)

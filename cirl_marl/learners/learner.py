@@ -21,23 +21,10 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import RecipeError, RunError
+from cirl_marl.learners import checkpoint
 from cirl_marl.learners.agent_env import AgentVecEnv, StepResult
 from cirl_marl.learners.algorithms import algorithm_class, build, has_replay_buffer
 from cirl_marl.learners.barrier import BarrierCallback, CheckpointBarrier, barrier_at_updates
-from cirl_marl.learners.checkpoint import (
-    UNREADABLE,
-    buffer_state,
-    freeze_statistics,
-    model_state,
-    normaliser_state,
-    read_tree,
-    set_buffer_state,
-    set_model_state,
-    set_normaliser_state,
-    set_variables,
-    variables,
-    write_tree,
-)
 from cirl_marl.learners.demonstrations import Demonstrator, demonstrate, keep_parameters, steps_counted
 from cirl_marl.learners.lockstep import BudgetSpent, Streams
 from cirl_marl.learners.policies import Policy
@@ -135,7 +122,7 @@ class Learner:
     def load(self, folder: Path) -> Learner:
         """Make the algorithm, and load the state that it had at the end of a training; errors as ``take`` has them."""
         self.build()
-        state = read_tree(folder, f"{self.name}.state")
+        state = checkpoint.read_tree(folder, f"{self.name}.state")
         with self._errors_name_file(folder):
             self._set(state)
         self.model._last_obs = None  # the episode that was under way is over
@@ -149,7 +136,10 @@ class Learner:
         of ``take``.
         """
         self.build()
-        state, log = read_tree(folder, f"{self.name}.state"), read_tree(folder, f"{self.name}.journal")
+        state, log = (
+            checkpoint.read_tree(folder, f"{self.name}.state"),
+            checkpoint.read_tree(folder, f"{self.name}.journal"),
+        )
 
         def load() -> None:
             with self._errors_name_file(folder):
@@ -178,19 +168,19 @@ class Learner:
         """Name the file in errors that reading the state raises."""
         try:
             yield
-        except (*UNREADABLE, RuntimeError, AssertionError) as error:
+        except (*checkpoint.UNREADABLE, RuntimeError, AssertionError) as error:
             path = folder / f"{self.name}.state.json"
             raise RunError(f"{path}: cannot be read: {error}; it holds what {self.agent_env.title} knew") from error
 
     def _set(self, state: Mapping[str, Any]) -> None:
-        set_model_state(self.model, state["model"])
+        checkpoint.set_model_state(self.model, state["model"])
         if self.normaliser is not None:
             if self.spec.start is not None and self.normaliser.norm_obs:
-                freeze_statistics(self.normaliser)
-            set_normaliser_state(self.normaliser, state["normaliser"])
+                checkpoint.freeze_statistics(self.normaliser)
+            checkpoint.set_normaliser_state(self.normaliser, state["normaliser"])
         buffer = getattr(self.model, "replay_buffer", None)
         if buffer is not None and state["buffer"] is not None:
-            set_buffer_state(buffer, state["buffer"])
+            checkpoint.set_buffer_state(buffer, state["buffer"])
 
     def write_state(self, folder: Path, more: Mapping[str, Any], *, in_stack: bool = False, last: bool = False) -> None:
         """Write policy and state, from which the learner resumes; at a barrier or at the end.
@@ -204,18 +194,18 @@ class Learner:
         self.save(folder)
         buffer = None if last else getattr(self.model, "replay_buffer", None)
         state = {
-            "model": model_state(self.model),
-            "normaliser": None if self.normaliser is None else normaliser_state(self.normaliser),
-            "buffer": None if buffer is None else buffer_state(buffer),
+            "model": checkpoint.model_state(self.model),
+            "normaliser": None if self.normaliser is None else checkpoint.normaliser_state(self.normaliser),
+            "buffer": None if buffer is None else checkpoint.buffer_state(buffer),
             "streams": self.streams.state_dict(active=not in_stack and not last),
             "stacked": in_stack,
         }
-        write_tree(folder, f"{self.name}.state", {**state, **more})
+        checkpoint.write_tree(folder, f"{self.name}.state", {**state, **more})
 
     def write_journal(self, folder: Path) -> None:
         """Write the steps since the state was written: the replay log."""
         log = [(action, step.state_dict()) for action, step in self.barrier.log or []]
-        write_tree(folder, f"{self.name}.journal", log)
+        checkpoint.write_tree(folder, f"{self.name}.journal", log)
 
     def budget(self, steps: int) -> int:
         """Joint steps after which it is stopped; only ARS, which may be in mid-update then, does not stop by itself."""
@@ -287,10 +277,10 @@ class Learner:
         state = {
             "algorithm": self.spec.algorithm,
             "policy": dict(self.model.policy.state_dict()),
-            "variables": variables(self.model),
-            "normaliser": None if self.normaliser is None else normaliser_state(self.normaliser),
+            "variables": checkpoint.variables(self.model),
+            "normaliser": None if self.normaliser is None else checkpoint.normaliser_state(self.normaliser),
         }
-        write_tree(folder, self.name, state)
+        checkpoint.write_tree(folder, self.name, state)
 
     def take(self, folder: Path) -> Learner:
         """Load what ``save`` wrote.
@@ -298,19 +288,19 @@ class Learner:
         Raises:
             RunError: if a file is missing, cannot be read, or is of another learner.
         """
-        state, path = read_tree(folder, self.name), folder / f"{self.name}.json"
+        state, path = checkpoint.read_tree(folder, self.name), folder / f"{self.name}.json"
         try:
             if state["algorithm"] != self.spec.algorithm:
                 raise RunError(f"it is of {state['algorithm']}, not {self.spec.algorithm}")
             self.model.policy.load_state_dict(state["policy"])
-            set_variables(self.model, state["variables"])
+            checkpoint.set_variables(self.model, state["variables"])
             keep_parameters(self.model)
             if self.normaliser is not None:
-                set_normaliser_state(self.normaliser, state["normaliser"], returns=False)
+                checkpoint.set_normaliser_state(self.normaliser, state["normaliser"], returns=False)
         except (RunError, RuntimeError) as error:
             message = f"{path}: '{self.name}' is for other observations or actions: {error}"
             raise RunError(message) from error
-        except UNREADABLE as error:
+        except checkpoint.UNREADABLE as error:
             raise RunError(f"{path}: cannot be read: {error!r}") from error
         return self
 

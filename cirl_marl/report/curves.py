@@ -259,8 +259,8 @@ def _draw_largest(axes: Axes, time: Floats, values: Floats, names: Sequence[str]
     change = np.ptp(values, axis=1) if values.size else np.zeros(len(values))
     largest = np.sort(np.argsort(-change, kind="stable")[:MOST_CURVES])
     for place, row in enumerate(largest.tolist()):
-        axes.plot(time, values[row], color=SERIES[place % len(SERIES)], linestyle=DASHES[place // len(SERIES)],
-                  linewidth=1.5, label=names[row], marker=_dots(time))  # fmt: skip
+        colour, dash = SERIES[place % len(SERIES)], DASHES[place // len(SERIES)]
+        axes.plot(time, values[row], dash, color=colour, linewidth=1.5, label=names[row], marker=_dots(time))
     axes.ticklabel_format(axis="y", useOffset=False)
     more = f": {MOST_CURVES} of {len(names)}, the largest changes" if len(names) > MOST_CURVES else ""
     style_axes(axes, title=title + more, ylabel=unit)

@@ -95,26 +95,16 @@ def cells_of(file: SweepFile) -> list[Cell]:
         file.seeds, file.networks, scenarios, recipes, *lists.values()
     ):
         options = dict(zip(lists, values, strict=True))
-        names = scenario or recipe.environment.get("scenario")
-        network = load_network(address, scenario=names)
+        network = load_network(address, scenario=scenario or recipe.environment.get("scenario"))
         begins = any(learner.start is not None for _, learner in recipe.learners())
         origins = ""
         if begins or seed == file.seeds[0]:
             config = prepare(address, recipe, seed=seed, scenario=network.scenario_name, **options).config
             read = {name: origin.sha256 for name, origin in config.origins.items()}
             origins = hashlib.sha256(json.dumps(read, sort_keys=True).encode()).hexdigest() if read else ""
-        cells.append(
-            Cell(
-                address=address,
-                network=network.name,
-                scenario=network.scenario_name,
-                recipe=recipe,
-                seed=seed,
-                options=tuple(options.items()),
-                definition_sha256=fingerprint(network),
-                origins=origins,
-            )
-        )
+        names: dict[str, str] = {"address": address, "network": network.name, "scenario": network.scenario_name}
+        names |= {"definition_sha256": fingerprint(network), "origins": origins}
+        cells.append(Cell(recipe=recipe, seed=seed, options=tuple(options.items()), **names))
     return cells
 
 
@@ -154,16 +144,9 @@ class CellJob:
         directory = load_network(cell.address, scenario=cell.scenario)
         if fingerprint(directory) != cell.definition_sha256:
             raise RunError(f"{cell.address}: was edited while the sweep was running; start the sweep again")
-        run = complete_run(
-            self.run_directory.path,
-            cell.address,
-            cell.recipe,
-            report=self._report(tell),
-            checkpoint_every=self.checkpoint_every,
-            scenario=cell.scenario,
-            seed=cell.seed,
-            **dict(cell.options),
-        )
+        options = {**dict(cell.options), "scenario": cell.scenario, "seed": cell.seed}
+        options |= {"report": self._report(tell), "checkpoint_every": self.checkpoint_every}
+        run = complete_run(self.run_directory.path, cell.address, cell.recipe, **options)
         asked = self.evaluation.model_dump()
         comparison = compare(
             [run], ["neutral"], **asked, progress=lambda activity, share: tell("evaluating", share, 1.0)

@@ -106,11 +106,7 @@ class SweepFolder:
         row |= {column: environment.get(key) for key, column in _ENVIRONMENT.items()}
         for figure in INTERVALS:
             interval = result.get(figure) or {}
-            row |= {
-                figure: interval.get("value"),
-                f"{figure}_low": interval.get("low"),
-                f"{figure}_high": interval.get("high"),
-            }
+            row |= {figure: interval.get("value")} | {f"{figure}_{end}": interval.get(end) for end in ("low", "high")}
         row |= {key: result.get(key) or None for key in ("unit", "no_bound", "checkpoint")}
         return row | {"cpu_seconds": JobFiles(self.jobs, name).figures().get("cpu_seconds")}
 
@@ -144,11 +140,9 @@ class SweepFolder:
             return
         mismatches = [name for key in now if key != "cells" for name in _differences(now[key], content.get(key), key)]
         more = f" and {len(mismatches) - MISMATCHES_SHOWN} more" if len(mismatches) > MISMATCHES_SHOWN else ""
-        raise RunError(
-            f"{self.path}: holds another sweep ({'; '.join(mismatches[:MISMATCHES_SHOWN])}{more}), of which "
-            f"{len(missing_cells)} of {len(cells)} cells are none of this one; "
-            "choose another folder. Nothing was changed"
-        )
+        other = f"holds another sweep ({'; '.join(mismatches[:MISMATCHES_SHOWN])}{more})"
+        count = f"of which {len(missing_cells)} of {len(cells)} cells are none of this one"
+        raise RunError(f"{self.path}: {other}, {count}; choose another folder. Nothing was changed")
 
 
 _ENVIRONMENT = {key: key for key in ("reward", "observe", "circularity_weight", "horizon", "uncertain")}
