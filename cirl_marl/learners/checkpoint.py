@@ -191,8 +191,7 @@ def set_buffer_state(buffer: ReplayBuffer, state: Mapping[str, Any]) -> None:
     """Fill an empty buffer; a ``ValueError`` if it is one of other observations, actions or rows."""
     for name, value in state.items():
         now = getattr(buffer, name)
-        parts = value.items() if isinstance(value, dict) else [(None, value)]
-        for key, part in parts:
+        for key, part in value.items() if isinstance(value, dict) else [(None, value)]:
             into = now if key is None else now[key]
             if isinstance(into, np.ndarray):
                 if into.shape[1:] != part.shape[1:] or len(part) > len(into):
@@ -299,12 +298,8 @@ def _noises(model: BaseAlgorithm) -> Iterator[Any]:
 def _explorers(model: BaseAlgorithm) -> list[Any]:
     """Return distributions whose noise depends on the state."""
     parts = (model.policy, getattr(model.policy, "actor", None))
-    distributions = [getattr(part, "action_dist", None) for part in parts]
-    return [
-        distribution
-        for distribution in distributions
-        if isinstance(getattr(distribution, MATRICES[0], None), torch.Tensor)
-    ]
+    drawn = [getattr(part, "action_dist", None) for part in parts]
+    return [source for source in drawn if isinstance(getattr(source, MATRICES[0], None), torch.Tensor)]
 
 
 def _first(value: Any, length: int, size: int) -> Any:

@@ -245,7 +245,6 @@ def _from_newest_checkpoint(
 
 
 def _config_to_go_on(run: RunDirectory, config: RunConfig, steps: int | None) -> RunConfig:
-    """Return the configuration by which a run goes on."""
     status = run.status
     done, complete = status["joint_steps"] * config.envs, status["state"] == "complete"
     if steps is not None:

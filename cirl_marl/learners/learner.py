@@ -33,7 +33,6 @@ from cirl_marl.learners.recipe import Group, LearnerSettings
 ACTING_PARAMETERS = ("policy_kwargs", "use_sde", "ent_coef", "gamma")
 """Parameters that shape the policy; the others matter to training only."""
 
-
 TENSORBOARD_ADVICE = "pip install 'cirl-marl[tensorboard]'"
 
 
@@ -136,10 +135,7 @@ class Learner:
         of ``take``.
         """
         self.build()
-        state, log = (
-            checkpoint.read_tree(folder, f"{self.name}.state"),
-            checkpoint.read_tree(folder, f"{self.name}.journal"),
-        )
+        state, log = (checkpoint.read_tree(folder, f"{self.name}.{part}") for part in ("state", "journal"))
 
         def load() -> None:
             with self._errors_name_file(folder):
@@ -298,8 +294,7 @@ class Learner:
             if self.normaliser is not None:
                 checkpoint.set_normaliser_state(self.normaliser, state["normaliser"], returns=False)
         except (RunError, RuntimeError) as error:
-            message = f"{path}: '{self.name}' is for other observations or actions: {error}"
-            raise RunError(message) from error
+            raise RunError(f"{path}: '{self.name}' is for other observations or actions: {error}") from error
         except checkpoint.UNREADABLE as error:
             raise RunError(f"{path}: cannot be read: {error!r}") from error
         return self

@@ -179,17 +179,9 @@ class World:
         dones = truncated | list(terminations.values())
         self._returns = self._returns + list(rewards.values())
         self._lengths = self._lengths + 1
-        returns = self._by_agent(self._returns)
-        step = JointStep(
-            observations,
-            self.env.state,
-            rewards,
-            self._by_agent(dones),
-            self._by_agent(truncated),
-            returns,
-            self._by_agent(self._lengths),
-            infos,
-        )
+        returns, lengths = self._by_agent(self._returns), self._by_agent(self._lengths)
+        ends = self._by_agent(dones), self._by_agent(truncated)
+        step = JointStep(observations, self.env.state, rewards, *ends, returns, lengths, infos)
         for agent_env in self.agent_envs.values():
             agent_env.receive_step(step)
         if hook is not None:

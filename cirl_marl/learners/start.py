@@ -122,11 +122,9 @@ def _other_entries(source: Mapping[str, Bounds], target: Mapping[str, Bounds]) -
     elif displaced_names := [name for name, opposite in zip(source, target, strict=True) if name != opposite]:
         yield f"sees the same in another order, from {_first_names(displaced_names)} on"
     else:
-        yield from (
-            f"sees '{name}' in {list(source[name])}, not in {list(target[name])}"
-            for name in target
-            if source[name] != target[name]
-        )
+        for name in target:
+            if source[name] != target[name]:
+                yield f"sees '{name}' in {list(source[name])}, not in {list(target[name])}"
 
 
 def _first_names(names: Sequence[str]) -> str:
@@ -136,9 +134,8 @@ def _first_names(names: Sequence[str]) -> str:
 
 def _other_shapes(source: BaseAlgorithm, target: BaseAlgorithm) -> Iterator[str]:
     """Yield which weights the policies do not have in common; the first says enough."""
-    old, new = (
-        {key: tuple(value.shape) for key, value in model.policy.state_dict().items()} for model in (source, target)
-    )
+    weights = (model.policy.state_dict() for model in (source, target))
+    old, new = ({key: tuple(value.shape) for key, value in part.items()} for part in weights)
     for key in (*old, *new):
         if old.get(key) != new.get(key):
             shapes = [str(shapes[key]) if key in shapes else "missing" for shapes in (old, new)]

@@ -209,7 +209,7 @@ class Training:
         return self.world.joint_steps
 
     def after_step(self, began: float, report: TrainingReport | None, infos: Infos, dones: NDArray[np.bool_]) -> None:
-        """TrainingReport, record finished episodes, evaluate, save checkpoints."""
+        """Report, record finished episodes, evaluate, save checkpoints."""
         seconds, copies, steps = time.perf_counter() - began, self.env.num_envs, self.joint_steps
         has_ended = bool(dones.any())
         if has_ended or report is not None:
@@ -254,13 +254,11 @@ class Training:
     @property
     def due(self) -> bool:
         """Whether it is time for a checkpoint."""
+        if self.run is None or self._checkpoint_folder is not None:
+            return False
         waiting_time = time.monotonic() - self._saved_at
         late = self._checkpoint_interval is not None and waiting_time >= self._checkpoint_interval
-        return (
-            self.run is not None
-            and self._checkpoint_folder is None
-            and (late or (self._due and waiting_time * COST >= self._checkpoint_seconds))
-        )
+        return late or (self._due and waiting_time * COST >= self._checkpoint_seconds)
 
     def ask(self) -> None:
         """Ask every learner for its state."""
@@ -334,9 +332,8 @@ class Training:
         for name, learner in self.learners.items():
             if learner.was_in_stack is not None and learner.was_in_stack != (name in names):
                 before, now = ("stacked", "by itself") if learner.was_in_stack else ("by itself", "stacked")
-                raise RunError(
-                    f"{learner.agent_env.title} learnt {before} and would go on {now}: give the same callbacks"
-                )
+                title = learner.agent_env.title
+                raise RunError(f"{title} learnt {before} and would go on {now}: give the same callbacks")
 
 
 def run_together(
@@ -417,27 +414,16 @@ def _participants(
     steps = trainings[0].config.steps
     for stack in stacks:
         titles = [member.agent_env.title for member in stack.members]
-        title = ", ".join(titles[:3] + ["…"] * (len(titles) > 3))
-        yield Participant(
-            f"the stack of {title}",
-            partial(stack.learn, steps),
-            stack.act,
-            Streams(),
-            [member.barrier for member in stack.members],
-        )
+        title = f"the stack of {', '.join(titles[:3] + ['…'] * (len(titles) > 3))}"
+        barriers = [member.barrier for member in stack.members]
+        yield Participant(title, partial(stack.learn, steps), stack.act, Streams(), barriers)
     member_ids = {id(member) for stack in stacks for member in stack.members}
     for training in trainings:
         for name, learner in training.learners.items():
             if id(learner) not in member_ids:
-                yield Participant(
-                    learner.agent_env.title,
-                    partial(learner.learn, steps, callbacks.get(name)),
-                    learner.act,
-                    learner.streams,
-                    [learner.barrier],
-                    partial(getattr, learner, "follows_demonstrator"),
-                    partial(learner.budget, steps),
-                )
+                title, learn = learner.agent_env.title, partial(learner.learn, steps, callbacks.get(name))
+                limits = partial(getattr, learner, "follows_demonstrator"), partial(learner.budget, steps)
+                yield Participant(title, learn, learner.act, learner.streams, [learner.barrier], *limits)
 
 
 @contextmanager

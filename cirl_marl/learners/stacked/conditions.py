@@ -33,10 +33,8 @@ def stacks(learners: Iterable[Learner], device: str) -> list[Stack]:
         settings = learner.spec.model_dump(exclude={"kind", "role", "agents"})
         key = f"{settings} {learner.agent_env.num_envs} {learner.model.num_timesteps}"
         groups.setdefault(key, []).append(learner)
-    return [
-        (SearchStack if isinstance(members[0].model, ARS) else RolloutStack)(members, device)
-        for members in groups.values()
-    ]
+    kinds = [SearchStack if isinstance(members[0].model, ARS) else RolloutStack for members in groups.values()]
+    return [kind(members, device) for kind, members in zip(kinds, groups.values(), strict=True)]
 
 
 def obstacle(learner: Learner) -> str | None:

@@ -10,14 +10,7 @@ from sb3_contrib.ars.policies import ARSPolicy
 from torch import Tensor, nn
 
 from cirl_marl.learners.learner import Learner
-from cirl_marl.learners.stacked.perceptrons import (
-    ACTIVATIONS,
-    Activation,
-    ParameterLayout,
-    Perceptrons,
-    layers_of,
-    linear_layers,
-)
+from cirl_marl.learners.stacked import perceptrons
 from cirl_marl.learners.stacked.stack import Stack
 
 
@@ -34,7 +27,7 @@ class SearchStack(Stack):
         """Take over parameters, counters and streams of the learners."""
         super().__init__(members, device)
         first = self._models[0]
-        self._layout = ParameterLayout(len(members))
+        self._layout = perceptrons.ParameterLayout(len(members))
         parts = [parts_of(model.policy) for model in self._models]
         self._fields = self._layout.layers([[*linear, head] for linear, head, _ in parts], self._inputs.actor_columns)
         self._activation = parts[0][2]
@@ -111,26 +104,19 @@ class SearchStack(Stack):
     def _returns(self, candidates: Tensor) -> Tensor:
         """Return the returns of each learner in the episodes of each candidate, shape (learners, candidates)."""
         at_once = self._copies // self._copies_per_candidate
-        parts = [
-            self._episodes(candidates[:, first : first + at_once]) for first in range(0, candidates.shape[1], at_once)
-        ]
-        return torch.cat(parts, dim=1)
+        return torch.cat([self._episodes(some) for some in torch.split(candidates, at_once, dim=1)], dim=1)
 
     def _episodes(self, candidates: Tensor) -> Tensor:
         """Let candidates, shape (learners, C, columns), act for one episode, each in its copies."""
         learners, count = candidates.shape[:2]
         matrix = candidates.reshape(learners * count, -1)
         agents = self._rows // self._copies  # rows of a shared policy, agent by agent
-        shape = (learners, agents, count, self._copies_per_candidate)
+        shape, rows = (learners, agents, count, self._copies_per_candidate), agents * self._copies_per_candidate
         observations, goes_on, total = self._inputs.begin(), True, torch.zeros(learners, count, device=self._device)
         offset = self._models[0].alive_bonus_offset
         while goes_on:
-            by_candidate = (
-                observations.view(*shape, -1)
-                .transpose(1, 2)
-                .reshape(len(matrix), agents * self._copies_per_candidate, -1)
-            )
-            actions = self._actions(matrix, by_candidate)
+            by_candidate = observations.view(*shape, -1).transpose(1, 2)
+            actions = self._actions(matrix, by_candidate.reshape(len(matrix), rows, -1))
             by_row = actions.view(learners, count, agents, self._copies_per_candidate, -1).transpose(1, 2)
             observations = self._move(by_row.reshape(learners, self._rows, -1))
             rewards, dones = self._inputs.rewards_and_dones()
@@ -139,7 +125,8 @@ class SearchStack(Stack):
         return total
 
     def _actions(self, matrix: Tensor, observations: Tensor) -> Tensor:
-        outputs = Perceptrons(layers_of(self._fields, matrix), self._activation).forward(observations)[-1]
+        layers = perceptrons.layers_of(self._fields, matrix)
+        outputs = perceptrons.Perceptrons(layers, self._activation).forward(observations)[-1]
         return outputs.tanh() if self._squashes else outputs
 
     def _log(self, returns: Tensor, spread: Tensor, size: Tensor, rate: float, std: float) -> None:
@@ -155,7 +142,7 @@ class SearchStack(Stack):
                 model.logger.dump(self._steps * self._copies)
 
 
-def parts_of(policy: ARSPolicy) -> tuple[list[nn.Linear], nn.Linear, Activation]:
+def parts_of(policy: ARSPolicy) -> tuple[list[nn.Linear], nn.Linear, perceptrons.Activation]:
     """Return hidden layers, last layer and activation of a policy.
 
     Raises:
@@ -164,10 +151,10 @@ def parts_of(policy: ARSPolicy) -> tuple[list[nn.Linear], nn.Linear, Activation]
     modules = list(policy.action_net.children())
     if policy.squash_output:
         modules = modules[:-1]
-    linear, kind = linear_layers(nn.Sequential(*modules[:-1]))
-    if type(modules[-1]) is not nn.Linear or (kind or nn.Tanh) not in ACTIVATIONS:
+    linear, kind = perceptrons.linear_layers(nn.Sequential(*modules[:-1]))
+    if type(modules[-1]) is not nn.Linear or (kind or nn.Tanh) not in perceptrons.ACTIVATIONS:
         raise TypeError(f"not linear layers with Tanh or ReLU between them: {policy.action_net}")
-    return linear, modules[-1], ACTIVATIONS[kind or nn.Tanh]
+    return linear, modules[-1], perceptrons.ACTIVATIONS[kind or nn.Tanh]
 
 
 def copies_per_candidate(learner: Learner) -> int:

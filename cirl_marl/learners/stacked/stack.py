@@ -127,13 +127,11 @@ class StackedInputs:
                     yield (i, slice(length)), self._moments[key], moments
 
     def _enter(self, i: int, observation: Any) -> None:
-        """Write an observation of a learner into the padded parts."""
         for key, part in self._parts.items():
             rows = observation[key] if isinstance(observation, dict) else observation
             part[i, :, : rows.shape[1]] = rows
 
     def _normalise(self) -> Tensor:
-        """Return the normalised parts side by side."""
         normaliser, parts = self._members[0].normaliser, list(self._parts.values())
         if normaliser is not None and normaliser.norm_obs:
             for place, (part, moments) in enumerate(zip(parts, self._moments.values(), strict=True)):

@@ -211,7 +211,6 @@ def _check(agent: str, space: spaces.Space[Any]) -> None:
 
 
 def _put(rows: AgentObservations, i: int, observation: Any, space: spaces.Space[Any], place: str) -> None:
-    """Write what an agent sees into a row."""
     parts = [(None, rows)] if not isinstance(rows, dict) else list(rows.items())
     for key, part in parts:
         if key is not None and not (isinstance(observation, Mapping) and key in observation):

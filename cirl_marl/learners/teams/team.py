@@ -160,10 +160,8 @@ class Team:
         def budget() -> int:
             return joint if isinstance(learner.model, ARS) or agent_env.missed_steps > missed_before else 2**62
 
-        learn = partial(learner.learn_on, steps, callbacks.get(agent))
-        return Participant(
-            agent_env.title, learn, learner.act, learner.streams, budget=budget, absent=lambda: agent_env.absent
-        )
+        learn, absent = partial(learner.learn_on, steps, callbacks.get(agent)), lambda: agent_env.absent
+        return Participant(agent_env.title, learn, learner.act, learner.streams, budget=budget, absent=absent)
 
     def evaluate(
         self, episodes: int = 10, *, seed: int = 0, deterministic: bool = True
