@@ -11,20 +11,7 @@ from typing import Annotated, Any, Literal, Union, get_type_hints
 from pydantic import BaseModel, Discriminator, Field, StrictBool, Tag, create_model
 from pydantic.json_schema import SkipJsonSchema
 
-from cirl_marl.definitions.quantities import (
-    ColumnTable,
-    Number,
-    QuantityTable,
-    Range,
-    Record,
-    SeriesTable,
-    Source,
-    StatedTable,
-    Table,
-    Time,
-    VaryingAmount,
-    number_forms,
-)
+from cirl_marl.definitions import quantities
 from cirl_marl.network.declarations import (
     CalendarTime,
     Declaration,
@@ -55,37 +42,37 @@ IN_MODEL = ("inner", "reward_scale")
 """Fields of compartments that stand in the table of their model."""
 
 
-class Batches(Table):
+class Batches(quantities.Table):
     """Discrete masses: ``masses[i]`` leaves the donor at ``times[i]``, at the start of a control interval."""
 
-    times: list[Number]
+    times: list[quantities.Number]
     time_unit: str
-    masses: list[Number]
+    masses: list[quantities.Number]
     unit: str
-    source: Source
+    source: quantities.Source
 
 
-class InnerRange(Table):
+class InnerRange(quantities.Table):
     """Initial range of an inner state, in the unit that its name carries."""
 
-    low: Number
-    high: Number
-    source: Source
+    low: quantities.Number
+    high: quantities.Number
+    source: quantities.Source
 
 
-class ModelTable(Table):
+class ModelTable(quantities.Table):
     """Inner physics of a compartment."""
 
     kind: str = Field(description="name of a compartment model")
     form: str | None = Field(None, description="form of the equations, such as 'published' or 'sound'")
-    parameters: dict[str, StrictBool | Number] = Field(
+    parameters: dict[str, StrictBool | quantities.Number] = Field(
         {}, description="parameters that differ from the model's own, by name"
     )
-    source: Source
+    source: quantities.Source
     initial: dict[str, InnerRange] = Field(
         {}, description="initial range of each inner state that the model does not draw"
     )
-    reward_scale: QuantityTable | None = Field(
+    reward_scale: quantities.QuantityTable | None = Field(
         None, description="the model's reward is divided by it, unit '1'; default 1"
     )
 
@@ -98,10 +85,10 @@ def table_of(record: type[Any], **more: Any) -> Any:
     types = {name: _field_type(field, hints[name]) for name, field in fields.items() if name not in IN_MODEL}
     keys = {name: _key(record, name, kind) for name, kind in types.items() if kind is not None}
     of_table = any(isinstance(declaration, Quantity) and declaration.unit_of_table for declaration in fields.values())
-    if of_table or VaryingAmount in types.values():
-        more |= {"unit": (str, ...), "source": (Source, ...)}
+    if of_table or quantities.VaryingAmount in types.values():
+        more |= {"unit": (str, ...), "source": (quantities.Source, ...)}
     summary = str(record.__doc__).partition("\n")[0]
-    return create_model(f"{record.__name__}Table", __base__=Table, __doc__=summary, **{**keys, **more})
+    return create_model(f"{record.__name__}Table", __base__=quantities.Table, __doc__=summary, **{**keys, **more})
 
 
 def _key(record: type[Any], name: str, kind: Any) -> tuple[Any, Any]:
@@ -121,12 +108,12 @@ def _field_type(declaration: Declaration, hint: Any) -> Any:
         return declaration.of if isinstance(declaration.of, type) else Literal[declaration.of]
     if isinstance(declaration, Numbers):
         tables: dict[str, Any] = {
-            "range": number_forms(Range, None, ColumnTable),
+            "range": quantities.number_forms(quantities.Range, None, quantities.ColumnTable),
             "batches": Batches,
-            "amount": VaryingAmount,
-            "list": list[Number],
-            "matrix": list[list[Number]],
-            "record": Record,
+            "amount": quantities.VaryingAmount,
+            "list": list[quantities.Number],
+            "matrix": list[list[quantities.Number]],
+            "record": quantities.Record,
         }
         return tables[declaration.table_form] if declaration.table_form else None
     if isinstance(declaration, Subtable):
@@ -134,13 +121,15 @@ def _field_type(declaration: Declaration, hint: Any) -> Any:
             declaration.of
         ]
     if isinstance(declaration, CalendarTime):
-        return Time
+        return quantities.Time
     if isinstance(declaration, Quantity) and declaration.unit_of_table:
-        return Number
+        return quantities.Number
     if isinstance(declaration, Quantity) and declaration.past:
-        return number_forms(None, SeriesTable, ColumnTable)
+        return quantities.number_forms(None, quantities.SeriesTable, quantities.ColumnTable)
     if isinstance(declaration, Quantity) and declaration.varies:
-        return number_forms(QuantityTable, SeriesTable, ColumnTable, declaration.none_word)
+        return quantities.number_forms(
+            quantities.QuantityTable, quantities.SeriesTable, quantities.ColumnTable, declaration.none_word
+        )
     if isinstance(declaration, Quantity):
         return FixedQuantity
     return {bool: StrictBool, tuple[str, ...]: list[str]}.get(hint, hint)
@@ -150,10 +139,10 @@ def _disturbance_table(kind: str) -> Any:
     """Return the table of a kind of disturbance, which says its kind."""
     word = Field(description=f"``{kind}``; other kinds: {', '.join(other for other in KINDS if other != kind)}")
     unit = Field(description=declarations(KINDS[kind])["unit"].meaning)
-    return table_of(KINDS[kind], kind=(Literal[kind], word), unit=(str, unit), source=(Source, ...))
+    return table_of(KINDS[kind], kind=(Literal[kind], word), unit=(str, unit), source=(quantities.Source, ...))
 
 
-FixedQuantity = number_forms(QuantityTable, None, ColumnTable)
+FixedQuantity = quantities.number_forms(quantities.QuantityTable, None, quantities.ColumnTable)
 _OF_CONTROL = {
     "disturbed_by": "name of a disturbance of its capacity, the value at action +1",
     "deviation": "standard deviation of its neutral value (of ``high`` where that is 0), in the same unit or relative; "
@@ -162,7 +151,7 @@ _OF_CONTROL = {
 }
 _STATED: dict[str, Any] = {}
 for _name in ("disturbed_by", "disturbed_as", "deviation", "range", "distribution"):
-    _stated = StatedTable.model_fields[_name]
+    _stated = quantities.StatedTable.model_fields[_name]
     _STATED[_name] = (_stated.annotation, Field(None, description=_OF_CONTROL.get(_name, _stated.description)))
 ControlTable = table_of(Control, **_STATED)
 LifetimeTable = table_of(Lifetime)
@@ -175,7 +164,7 @@ ObjectiveTable = table_of(Objective)
 ObservationTable = table_of(Observation)
 DISTURBANCES: dict[str, Any] = {kind: _disturbance_table(kind) for kind in KINDS}
 """The table of each kind of disturbance."""
-CorrelationTable = table_of(Correlation, source=(Source, ...))
+CorrelationTable = table_of(Correlation, source=(quantities.Source, ...))
 
 
 class NoKind(BaseModel):
@@ -194,14 +183,14 @@ _KIND_TABLES = [Annotated[table, Tag(f"<{kind}>")] for kind, table in _BY_KIND.i
 DisturbanceTable = Annotated[Union[*_KIND_TABLES], Discriminator(_disturbance_kind)]  # type: ignore[valid-type]
 
 
-class UnitsTable(Table):
+class UnitsTable(quantities.Table):
     """Units in which the network is simulated and reported."""
 
     mass: str
     time: str
 
 
-class ScalesTable(Table):
+class ScalesTable(quantities.Table):
     """Reference stock and flow of compartments that state none of their own."""
 
     stock: FixedQuantity  # type: ignore[valid-type]
@@ -211,7 +200,7 @@ class ScalesTable(Table):
 Changes = Annotated[dict[Identifier, dict[str, Any]], Field(default_factory=dict)]
 
 
-class CopiesTable(Table):
+class CopiesTable(quantities.Table):
     """Copies of another definition, side by side in this one."""
 
     of: str = Field(description="the definition that is copied, a file in the same folder or below it, with regions")
@@ -224,7 +213,7 @@ class CopiesTable(Table):
     disturbances: Changes = Field(description="likewise, or new ones; those that are ``common`` stand in no copy")
 
 
-class NetworkTable(Table):
+class NetworkTable(quantities.Table):
     """A material network."""
 
     name: Identifier

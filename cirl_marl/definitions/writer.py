@@ -15,16 +15,7 @@ import tomlkit
 
 from cirl_marl.compartments import kind_of
 from cirl_marl.errors import NetworkError
-from cirl_marl.network import Network
-from cirl_marl.network.declarations import (
-    CalendarTime,
-    Numbers,
-    Quantity,
-    Subtable,
-    declarations,
-    default_of,
-    is_required,
-)
+from cirl_marl.network import Network, declarations
 from cirl_marl.network.elements import Arc, Compartment, Control, ControlKind, Law
 from cirl_marl.network.series import Series, Value
 from cirl_marl.network.uncertainty import CAPACITY, Spread
@@ -122,22 +113,22 @@ class _Writer:
     def _part(self, part: Any, path: str = "") -> dict[str, Any]:
         """Return the table of a part, without what is as it is by default; ``path`` is its path."""
         table: dict[str, Any] = {}
-        for name, declaration in declarations(type(part)).items():
+        for name, declaration in declarations.declarations(type(part)).items():
             value, key = getattr(part, name), declaration.key or name
-            must_write = is_required(type(part), name) or name == _law_field(part)
+            must_write = declarations.is_required(type(part), name) or name == _law_field(part)
             must_write = must_write or f"{path}.{name}" in {**self._network.uncertain, **self._network.disturbed}
-            if not must_write and value == default_of(type(part), name):
+            if not must_write and value == declarations.default_of(type(part), name):
                 continue
-            if isinstance(declaration, CalendarTime):
+            if isinstance(declaration, declarations.CalendarTime):
                 table[key] = value if isinstance(value, date) else float(value)
-            elif isinstance(declaration, Quantity) and declaration.unit_of_table:
+            elif isinstance(declaration, declarations.Quantity) and declaration.unit_of_table:
                 unit_ = self._units.get(declaration.kind(part)) or part.unit
                 table |= {key: float(value), "unit": unit_, "source": SOURCE}
-            elif isinstance(declaration, Quantity):
+            elif isinstance(declaration, declarations.Quantity):
                 spread = self._network.uncertain.get(f"{path}.{name}")
                 table[key] = self._quantity(value, declaration.kind(part)) | _spread_keys(spread, value)
                 table[key] |= self._disturbance_keys(f"{path}.{name}")
-            elif isinstance(declaration, Numbers):
+            elif isinstance(declaration, declarations.Numbers):
                 unit = {"unit": self._units.get(declaration.of, "1"), "source": SOURCE}
                 if declaration.table_form == "range":
                     table[key] = {"low": float(value[0]), "high": float(value[1]), **unit}
@@ -148,7 +139,7 @@ class _Writer:
                     table[key] = [*map(float, value)]
                 elif declaration.table_form == "matrix":
                     table[key] = [[*map(float, row)] for row in value]
-            elif isinstance(declaration, Subtable):
+            elif isinstance(declaration, declarations.Subtable):
                 write = {"control": self._control, "model": self._model}.get(declaration.of)
                 table[key] = write(part) if write else self._part(value)
                 if isinstance(value, Control):

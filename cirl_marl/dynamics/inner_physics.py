@@ -50,9 +50,7 @@ class InnerPhysics:
         self._outflow_models = [(i, model) for i, model in numbered_models if isinstance(model, OutflowModel)]
         self._measuring_models = [(i, model) for i, model in numbered_models if isinstance(model, MeasuringModel)]
         self._tasks = [(i, model) for i, model in numbered_models if isinstance(model, Task)]
-        self._releasing_models = {
-            owner: model for owner, model in model_of.items() if isinstance(model, ReleasingModel)
-        }
+        self._releasing_models = {id_: model for id_, model in model_of.items() if isinstance(model, ReleasingModel)}
         self._vehicles = {owner: model for owner, model in model_of.items() if isinstance(model, Vehicle)}
         self.measure_names = tuple(
             f"{self.owners[i]}.{name}" for i, model in self._measuring_models for name in model.measure_names
@@ -68,9 +66,8 @@ class InnerPhysics:
         self._own_step = [(i, model) for i, model in own_steppers if not (euler and isinstance(model, ContinuousModel))]
         self._with_mean_output = {i for i, _ in self._own_step}
         not_by_solver = self._with_mean_output.union(i for i, _ in self._discrete)
-        self._continuous = [
-            (i, m) for i, m in numbered_models if isinstance(m, ContinuousModel) and i not in not_by_solver
-        ]
+        continuous = ((i, model) for i, model in numbered_models if isinstance(model, ContinuousModel))
+        self._continuous = [(i, model) for i, model in continuous if i not in not_by_solver]
         all_rows = np.arange(len(self.names))
         self._solver_rows = np.concatenate([all_rows[:0], *(all_rows[self._states[i]] for i, _ in self._continuous)])
         has_range = (name in model.ranged_states for model in self._models for name in model.state_names)
@@ -82,10 +79,9 @@ class InnerPhysics:
         self._speed = [factor(network.time_unit, model.time_unit) for model in self._models]
         takes = (o.control is not None and o.control.kind is ControlKind.INPUT for o in owners)
         self._inputs = [network.control_rows[o.id] if t else slice(0, 0) for o, t in zip(owners, takes, strict=True)]
-        self._context_rows = [
-            network.node_index[o] if o in network.node_index else rows.aboard.get(o) for o in self.owners
-        ]
-        self._kg, index = factor(network.mass_unit, "kg") if owners else 1.0, network.node_index
+        index = network.node_index
+        self._context_rows = [index[o] if o in index else rows.aboard.get(o) for o in self.owners]
+        self._kg = factor(network.mass_unit, "kg") if owners else 1.0
         self._plants = {index[o]: (self.rows[o], model) for o, model in model_of.items() if o in index}
 
     def start(self, stream: np.random.Generator) -> Floats:

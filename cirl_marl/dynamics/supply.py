@@ -188,14 +188,9 @@ class Supply:
                 target = np.minimum(low + weights * extent, high)
                 all_controls[self.rows] = np.where(idle, target, controls[self.rows])
                 copies = np.flatnonzero(open_)
-                part = dynamics.advance(
-                    stock.take(copies, axis=1),
-                    inner.take(copies, axis=1),
-                    all_controls.take(copies, axis=1),
-                    step[copies],
-                    None if factors is None else factors.take(copies, axis=1),
-                    terms=terms,
-                )
+                masses, insides, asked = (table.take(copies, axis=1) for table in (stock, inner, all_controls))
+                drawn = None if factors is None else factors.take(copies, axis=1)
+                part = dynamics.advance(masses, insides, asked, step[copies], drawn, terms=terms)
                 done = part if done is None or len(copies) == batch else _with_copies(done, copies, part)
                 earlier, base[:, copies] = base.copy(), self._quantities(part)
                 shortage = demand - base

@@ -37,14 +37,10 @@ class _Alike:
     @classmethod
     def of(cls, members: Sequence[tuple[int, Split, Integers]]) -> _Alike:
         """Stack splits, each with its node and what its arcs enter."""
-        bounds = np.stack([split.bounds for _, split, _ in members])
-        return cls(
-            donors=np.array([i for i, _, _ in members], dtype=np.intp),
-            ends=np.stack([ends for _, _, ends in members]),
-            low=bounds[:, 0],
-            high=bounds[:, 2],
-            proportions=np.stack([split.proportions for _, split, _ in members]),
-        )
+        nodes, alike, ends = zip(*members, strict=True)
+        bounds = np.stack([split.bounds for split in alike])
+        proportions = np.stack([split.proportions for split in alike])
+        return cls(np.array(nodes, dtype=np.intp), np.stack(ends), bounds[:, 0], bounds[:, 2], proportions)
 
     def end_values(self, values: Floats) -> Floats:
         """Return the values at the ends of the arcs, 0 at stocks, shape (splits, arcs, n)."""

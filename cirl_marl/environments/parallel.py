@@ -121,13 +121,10 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
             return {}, {}, {}, {}, {}
         agents, outcome = self.possible_agents, self.advance(self._stack(actions))
         observation, slices = outcome.observation[:, 0], self.layout.slices
-        return (
-            {agent: observation[slices[agent]] for agent in agents},
-            dict(zip(agents, outcome.reward[:, 0].tolist(), strict=True)),
-            dict.fromkeys(agents, False),
-            dict.fromkeys(agents, bool(outcome.truncated[0])),
-            self._infos(outcome),
-        )
+        observations = {agent: observation[slices[agent]] for agent in agents}
+        rewards = dict(zip(agents, outcome.reward[:, 0].tolist(), strict=True))
+        terminations, truncations = (dict.fromkeys(agents, flag) for flag in (False, bool(outcome.truncated[0])))
+        return observations, rewards, terminations, truncations, self._infos(outcome)
 
     def advance(self, actions: Floats) -> Outcome:
         """Hold the actions of all agents one after the other, shape (entries, 1); see ``MultiAgentVectorEnv``."""

@@ -53,10 +53,8 @@ class Scoring:
         self._measure = _measurement(network, layout)
         self._vary_in_time = any(isinstance(band, Series) for s in services for band in (s.low, s.high))
         width = network.episode.horizon if self._vary_in_time else 1
-        bands = [
-            np.array([network.interval_means(getattr(s, end))[:width] for s in services]) for end in ("low", "high")
-        ]
-        self._low, self._high = (band.reshape(len(services), width) for band in bands)
+        bands = [[network.interval_means(getattr(s, end))[:width] for s in services] for end in ("low", "high")]
+        self._low, self._high = (np.array(band).reshape(len(services), width) for band in bands)
         self._factors = [
             RowFactors({row: numbers[s.id] for row, s in enumerate(services) if s.id in numbers})
             for numbers in (numbers_of(ranges, "services", end) for end in ("low", "high"))
@@ -69,9 +67,8 @@ class Scoring:
         inner = range(count + len(services), terms)
         owners = np.array([*with_set_point, *(owner for owner, _, _ in debts), *with_model], dtype=np.intp)
         columns = np.array([*with_set_point, *(term for _, term, _ in debts), *inner], dtype=np.intp)
-        weights = np.array(
-            [*[1.0] * len(with_set_point), *(weight for _, _, weight in debts), *[-1.0] * len(with_model)]
-        )
+        own, models = [1.0] * len(with_set_point), [-1.0] * len(with_model)
+        weights = np.array([*own, *(weight for _, _, weight in debts), *models])
         self._by_compartment = RowSum(owners, columns, -weights, (len(compartments), terms))
         self._by_agent = self._by_compartment.select_rows([position[agent] for agent in agents])
         sums = self._by_compartment.column_sums()

@@ -181,9 +181,8 @@ class MultiAgentVectorEnv:
         """
         step, state = self._next_interval(), self._state
         factors = None if state is None else self.factors_in(step)
-        joint: dict[str, Floats] = self.actuators.neutral_action(step, factors) | {
-            a: np.asarray(x) for a, x in actions.items()
-        }
+        neutral: dict[str, Floats] = self.actuators.neutral_action(step, factors)
+        joint = neutral | {agent: np.asarray(action) for agent, action in actions.items()}
         suppliers = [arc for arc in self.supply.arcs if arc in self.agents and arc not in actions]
         if suppliers and state is not None and (state.step < self.network.episode.horizon).all():
             controls = self.actuators.controls(self.stack(joint), step, factors)
@@ -258,13 +257,9 @@ class MultiAgentVectorEnv:
             observation = self._restart(outcome.truncated)
         terminated = np.zeros(self.num_envs, dtype=bool)
         terminated.flags.writeable = outcome.truncated.flags.writeable = False  # one array for all agents
-        return (
-            self.by_agent(observation),
-            {agent: outcome.reward[i] for i, agent in enumerate(self.agents)},
-            dict.fromkeys(self.agents, terminated),
-            dict.fromkeys(self.agents, outcome.truncated),
-            infos,
-        )
+        rewards = dict(zip(self.agents, outcome.reward, strict=True))
+        terminations, truncations = (dict.fromkeys(self.agents, flag) for flag in (terminated, outcome.truncated))
+        return self.by_agent(observation), rewards, terminations, truncations, infos
 
     def team_info(self, outcome: Outcome) -> dict[str, Any]:
         """Return what infos say to all agents of the interval of ``outcome``, the last one; arrays are read-only.

@@ -128,5 +128,4 @@ def finite_or_none(value: float) -> float | None:
 
 
 def _joint_mean(*strata: Floats, axis: int = -1) -> Floats:
-    mean: Floats = stats.trim_mean(np.concatenate(strata, axis=axis), TRIM_SHARE, axis=axis)
-    return mean
+    return np.asarray(stats.trim_mean(np.concatenate(strata, axis=axis), TRIM_SHARE, axis=axis))

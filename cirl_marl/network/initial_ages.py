@@ -66,8 +66,7 @@ def age_shares(node: Node, interval: float) -> Floats:
         parts = lifetime.chain.growing_stock(growth * lifetime.mean)
     else:
         parts = np.append(np.exp(-growth * interval * np.arange(slots(lifetime, interval))), 0.0)
-    whole: Floats = parts / parts.sum()
-    return whole
+    return np.asarray(parts / parts.sum())
 
 
 @lru_cache(maxsize=256)  # commodities and scenarios share lifetimes, and a matrix exponential takes milliseconds

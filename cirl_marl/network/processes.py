@@ -184,10 +184,8 @@ class DisturbanceProcesses:
         """Return the means of the values of Gaussian processes whose z has these means and variances."""
         if not len(self._rows):
             return latent
-        middle, deviation = (
-            self._offset_table(step + 1)[step] + self._deviation * latent,
-            self._deviation * np.sqrt(variance),
-        )
+        middle = self._offset_table(step + 1)[step] + self._deviation * latent
+        deviation = self._deviation * np.sqrt(variance)
         bounds = self.low[self._rows, None], self.high[self._rows, None]
         means = np.empty(middle.shape)
         for is_log in (False, True):
@@ -275,8 +273,7 @@ def _clipped_means(middle: Floats, deviation: Floats, low: Floats, high: Floats,
         if is_log:
             within = np.exp(middle + deviation**2 / 2) * _between(first - deviation, last - deviation)
         else:
-            densities = (np.exp(-(end**2) / 2) / np.sqrt(2 * np.pi) for end in (first, last))
-            start, stop = densities
+            start, stop = (np.exp(-(end**2) / 2) / np.sqrt(2 * np.pi) for end in (first, last))
             within = middle * _between(first, last) + deviation * (start - stop)
         means = low * below + high * above + within
         certain = np.clip(np.exp(middle) if is_log else middle, low, high)

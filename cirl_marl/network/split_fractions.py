@@ -70,8 +70,7 @@ class Split:
         certain = np.where(out, low, 0.0).sum(axis=0)
         # the arcs that stay take their highest shares first
         room = np.maximum(0.0, 1.0 - certain - np.where(out, 0.0, high).sum(axis=0))
-        least: Floats = certain + room * np.where(free, self.proportions[:, steps], 0.0).sum(axis=0)
-        return least
+        return np.asarray(certain + room * np.where(free, self.proportions[:, steps], 0.0).sum(axis=0))
 
     def problems(self) -> Iterator[str]:
         """Yield why these are no shares of a whole in some interval."""
@@ -108,8 +107,7 @@ def proportions(shares: Floats, remainder: Floats) -> Floats:
     total = weights.sum(axis=0)
     # where neutral control leaves nothing to them, the one of the rest takes what there may be
     weights = np.where(total > 0, weights, rest)
-    fractions: Floats = weights / weights.sum(axis=0)
-    return fractions
+    return np.asarray(weights / weights.sum(axis=0))
 
 
 def splits(network: Specification) -> list[Split]:
@@ -133,19 +131,16 @@ def splits(network: Specification) -> list[Split]:
                 columns = horizon
                 sides = [list(map(network.interval_means, side)) for side in sides]
                 shares = list(map(network.interval_means, shares))
-            divisions.append(
-                Split(
-                    donor=node.id,
-                    controlled_arcs=tuple(k for k, arc in exits if arc.control is not None),
-                    other_arcs=tuple(k for k, _ in free),
-                    bounds=np.broadcast_to(
-                        np.array(sides, dtype=float).reshape(3, -1, columns), (3, len(controls), horizon)
-                    ),
-                    stated_shares=np.broadcast_to(
-                        np.array(shares, dtype=float).reshape(-1, columns), (len(free), horizon)
-                    ),
-                )
+            bounds = np.array(sides, dtype=float).reshape(3, -1, columns)
+            stated = np.array(shares, dtype=float).reshape(-1, columns)
+            split = Split(
+                donor=node.id,
+                controlled_arcs=tuple(k for k, arc in exits if arc.control is not None),
+                other_arcs=tuple(k for k, _ in free),
+                bounds=np.broadcast_to(bounds, (3, len(controls), horizon)),
+                stated_shares=np.broadcast_to(stated, (len(free), horizon)),
             )
+            divisions.append(split)
     return divisions
 
 
@@ -166,9 +161,8 @@ def trap_problems(network: Specification, divisions: Sequence[Split]) -> Iterato
     traps_mass = _trapping_nodes(network, by_donor, steps)
     if traps_mass.any():
         first = int(traps_mass.any(axis=0).argmax())
-        loop = _loop(
-            network, by_donor, {node for node, traps in zip(by_donor, traps_mass[:, first], strict=True) if traps}
-        )
+        trap = {node for node, traps in zip(by_donor, traps_mass[:, first], strict=True) if traps}
+        loop = _loop(network, by_donor, trap)
         interval = "" if (columns == columns[:, :1]).all() else f" in interval {steps[first]}"
         yield (
             f"nodes {', '.join(loop)} store nothing and can pass all they get round in a loop{interval}: the arcs that "

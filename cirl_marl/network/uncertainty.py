@@ -65,8 +65,7 @@ class Spread(CheckedRecord):
             return np.asarray(self.low + share * (self.high - self.low))
         low, high = self._ends(self.deviation)
         first, last = (self._below(end, self.deviation) for end in (low, high))
-        factors: Floats = np.clip(self._factor(first + share * (last - first), self.deviation), low, high)
-        return factors
+        return np.asarray(np.clip(self._factor(first + share * (last - first), self.deviation), low, high))
 
     def _ends(self, deviation: float) -> tuple[float, float]:
         """Return the range, cut to where next to nothing is drawn."""

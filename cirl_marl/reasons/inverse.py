@@ -234,8 +234,7 @@ class _Cone:
 
     def _per_spread(self, values: Floats) -> Floats:
         """Divide by how much of each term there is to be had; 0 for what nothing changes."""
-        quotient: Floats = np.divide(values, self.spread, out=np.zeros_like(values), where=self._moves)
-        return quotient
+        return np.asarray(np.divide(values, self.spread, out=np.zeros_like(values), where=self._moves))
 
     def _row(self, plan: int, point: Floats) -> Floats:
         return self._per_spread(point - self._plans[plan].value)

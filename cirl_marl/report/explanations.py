@@ -17,17 +17,10 @@ from cirl_marl.errors import RunError
 from cirl_marl.evaluation.figures import provenance
 from cirl_marl.evaluation.statistics import Aggregate
 from cirl_marl.learners.run_directory import RunDirectory
+from cirl_marl.reasons import sentences
 from cirl_marl.reasons.attribution import PairedDifference
 from cirl_marl.reasons.explanation import Explanation
 from cirl_marl.reasons.prices import ShadowPrices
-from cirl_marl.reasons.sentences import (
-    action_text,
-    compartment_label,
-    condition_text,
-    interval_names,
-    paragraphs,
-    signal_text,
-)
 from cirl_marl.records.files import publish_folder, read_record, write_json, write_table
 from cirl_marl.report.terminal import text_table
 
@@ -51,7 +44,7 @@ def write_reasons(explanation: Explanation, folder: Path, **options: Any) -> lis
         OSError: if the folder cannot be written.
     """
     names = ["reasons.txt", FILE]
-    sections = list(paragraphs(explanation))
+    sections = list(sentences.paragraphs(explanation))
     tables = {"prices.csv": _price_rows, "inputs.csv": _input_rows, "rules.csv": _rule_rows}
     with publish_folder(folder) as draft:
         text = "\n\n".join("\n".join([heading, *sentences]) for heading, sentences in sections)
@@ -92,7 +85,7 @@ def read_reasons(run: RunDirectory, checkpoint: str) -> tuple[Reasons, str]:
 def prices_table(prices: ShadowPrices) -> Table:
     """Return one row a stock, demand and agent: the first, the largest and the last price of it, or the whole."""
     network, agents = prices.network, list(prices.bound.agents)
-    times, mass = interval_names(network), network.mass_unit
+    times, mass = sentences.interval_names(network), network.mass_unit
     groups = [
         (f"one {mass} in the stock", [node.id for node in network.stores], prices.stock),
         ("one unit of demand", [service.id for service in network.services], prices.demand),
@@ -132,7 +125,7 @@ def _price_rows(explanation: Explanation) -> Rows:
     if explanation.prices is None:
         return
     prices, network = explanation.prices, explanation.network
-    mass, times = network.mass_unit, interval_names(network)
+    mass, times = network.mass_unit, sentences.interval_names(network)
     for i, node in enumerate(network.stores):
         for time, price in zip(times, prices.stock[:, i].tolist(), strict=True):
             yield ["stock at the start", node.id, time, _digits(price), f"{mass} per {mass}"]
@@ -173,8 +166,8 @@ def _rule_rows(explanation: Explanation) -> Rows:
     for rule in explanation.rules.rules:
         for leaf in rule.leaves:
             control = "; ".join(_digits(value) for value in leaf.control.tolist())
-            condition = condition_text(network, leaf.conditions) or "always"
-            action = action_text(network, rule.agent, leaf)
+            condition = sentences.condition_text(network, leaf.conditions) or "always"
+            action = sentences.action_text(network, rule.agent, leaf)
             shares = _digits(leaf.share), _digits(rule.explained_variance)
             yield [rule.agent, condition, action, control, *shares, *_outcome(rule.cost)]
     yield ["all together", "", "", "", "", "", *_outcome(explanation.rules.together)]
@@ -210,7 +203,7 @@ def _draw_stocks(axes: Axes, prices: ShadowPrices) -> None:
     time = axis_time(interval_ends(network) - network.episode.control_interval, network)
     for place, i in enumerate(np.argsort(-largest, kind="stable")[:LINES].tolist()):
         if largest[i] > 0:
-            label = compartment_label(network, network.stores[i].id)
+            label = sentences.compartment_label(network, network.stores[i].id)
             axes.plot(time, prices.stock[:, i], color=SERIES[place], label=label)
     mass = network.mass_unit
     style_axes(axes, title=f"What one more {mass} in a stock is worth in λ̄", ylabel=f"{mass} per {mass}")
@@ -224,7 +217,7 @@ def _draw_room(axes: Axes, prices: ShadowPrices) -> None:
     sizes = np.abs(room).ravel()
     largest = np.argsort(-sizes, kind="stable")[:BARS]
     cells = [divmod(flat, room.shape[1]) for flat in largest.tolist() if sizes[flat] > WORTH_TELLING * sizes.max()]
-    labels = [f"{compartment_label(network, agents[a])}, {('lower', 'upper')[side]}" for side, a in cells]
+    labels = [f"{sentences.compartment_label(network, agents[a])}, {('lower', 'upper')[side]}" for side, a in cells]
     values = [float(room[cell]) for cell in cells]
     axes.barh(range(len(values)), values, color=[GOOD if value > 0 else WARNING for value in values], height=0.6)
     axes.set_yticks(range(len(labels)), labels)
@@ -240,13 +233,13 @@ def _draw_inputs(axes: Axes, explanation: Explanation) -> None:
         for i, share in enumerate(inputs.share[: inputs.top].tolist()):
             axes.barh(row, share, left=start, color=SERIES[i % len(SERIES)], height=0.7, alpha=0.85)
             if share > 0.12:
-                label, letters = signal_text(network, inputs.signals[i]), int(105 * share)
+                label, letters = sentences.signal_text(network, inputs.signals[i]), int(105 * share)
                 label = label if len(label) <= letters else label[: letters - 1] + "…"
                 axes.text(start + 0.005, row, label, va="center", fontsize=7, color="white")
             start += share
         cost = number(inputs.top_held.circularity.value)
         axes.text(1.01, row, cost, va="center", fontsize=7, transform=axes.get_yaxis_transform())
-    labels = [compartment_label(network, inputs.agent) for inputs in explanation.inputs]
+    labels = [sentences.compartment_label(network, inputs.agent) for inputs in explanation.inputs]
     axes.set_yticks(range(len(labels)), labels)
     axes.set_xlim(0, 1)
     axes.invert_yaxis()
