@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -57,16 +57,9 @@ def simulate(
     from cirl_marl.evaluation.simulations import simulate_alternatives
 
     constants, folder = _constants(controls, set_ or []), common.folder_for(out or Path(), "--out")
+    options: dict[str, Any] = {"controls": controls, "constants": constants, "steps": steps, "seed": seed}
     with common.bar("simulating") as progress:
-        found = simulate_alternatives(
-            network,
-            scenarios=scenario or [None],
-            controls=controls,
-            constants=constants,
-            steps=steps,
-            seed=seed,
-            progress=progress,
-        )
+        found = simulate_alternatives(network, scenarios=scenario or [None], **options, progress=progress)
     files = {common.stem(simulation.network, simulation.control): simulation for simulation in found}
     if len(found) == 1:
         _write_one(folder, files)
@@ -190,16 +183,9 @@ def plan(
     if out is not None and out.suffix != ".csv":
         raise CirlError(f"--out {out}: needs the name of a .csv file")
     page = common.page_for(html)
+    options: dict[str, Any] = {"scenario": scenario, "min_service": min_service, "seed": seed, "smooth": smooth}
     with common.bar("planning") as progress:
-        schedule = plans.plan(
-            source,
-            control,
-            scenario=scenario,
-            min_service=min_service,
-            seed=seed,
-            smooth=smooth,
-            progress=progress,
-        )
+        schedule = plans.plan(source, control, **options, progress=progress)
     network = schedule.network
     stem_of_file = Path(source).resolve().name if control is None else common.stem(network, control)
     path = Path(f"plan_{stem_of_file}.csv") if out is None else out

@@ -56,15 +56,9 @@ def explain(
         out = Path(source) / FOLDER if is_run else Path(f"reasons_{stem}")
     folder = common.writable_folder(out, "--out")
     options: dict[str, Any] = {"min_service": min_service, "episodes": episodes, "seed": seed, "top": top}
+    chosen = None if parts is None else common.comma_separated(parts)
     with shares() as progress:
-        explanation_ = explained(
-            source,
-            parts=None if parts is None else common.comma_separated(parts),
-            scenario=scenario,
-            leaves=leaves,
-            progress=progress,
-            **options,
-        )
+        explanation_ = explained(source, parts=chosen, scenario=scenario, leaves=leaves, progress=progress, **options)
     from cirl_marl.reasons.sentences import paragraphs
 
     if explanation_.prices is not None:
@@ -120,18 +114,10 @@ def infer(
         if out.is_dir():
             raise CirlError(f"--out {out}: is a folder, not a file")
         common.writable_folder(out.parent, "--out")
+    kinds = KINDS if terms is None else common.comma_separated(terms)
+    options: dict[str, Any] = {"scenario": scenario, "seed": seed, "episodes": episodes, "seconds": seconds}
     with common.bar("weighing") as progress:
-        weights = inferred(
-            network,
-            plans,
-            kinds=KINDS if terms is None else common.comma_separated(terms),
-            within=within,
-            scenario=scenario,
-            seed=seed,
-            episodes=episodes,
-            seconds=seconds,
-            progress=progress,
-        )
+        weights = inferred(network, plans, kinds=kinds, within=within, progress=progress, **options)
     console.print(weights_table(weights))
     for sentence in weights_sentences(weights):
         say(sentence)

@@ -75,13 +75,8 @@ def _column_value(
         return values[0]
     times = clock.times(tuple(column.times), table.time_unit)
     last = times[-1] - times[-2] if len(times) > 1 else factor(table.time_unit or "year", clock.unit)
-    return Series(
-        times=times,
-        values=values,
-        interpolation=table.interpolation,
-        until=times[-1] + last if table.interpolation == "step" else None,
-        origin=column.origin,
-    )
+    until = times[-1] + last if table.interpolation == "step" else None
+    return Series(times=times, values=values, interpolation=table.interpolation, until=until, origin=column.origin)
 
 
 def product(value: Value, factor_: Value) -> Value:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -124,16 +124,8 @@ def simulate(
     Raises:
         CirlError: if scenario or controller is unknown, does not fit the network, or does not take ``constants``.
     """
-    (only,) = simulate_alternatives(
-        network,
-        scenarios=[scenario],
-        controls=[control],
-        constants=constants,
-        steps=steps,
-        seed=seed,
-        progress=progress,
-    )
-    return only
+    options: dict[str, Any] = {"constants": constants, "steps": steps, "seed": seed, "progress": progress}
+    return simulate_alternatives(network, scenarios=[scenario], controls=[control], **options)[0]
 
 
 def simulate_alternatives(
@@ -233,9 +225,6 @@ def _obstacles(first: Network, second: Network) -> Iterator[str]:
     if episode_1.start != episode_2.start:
         yield f"start on the calendar {episode_1.start or 'none'} and {episode_2.start or 'none'}"
     if not math.isclose(episode_1.horizon * episode_1.control_interval, episode_2.horizon * episode_2.control_interval):
-        value_1, value_2 = (
-            f"{timing.horizon} intervals of {timing.control_interval:g} {first.time_unit}"
-            for timing in (episode_1, episode_2)
-        )
+        lengths = [f"{x.horizon} intervals of {x.control_interval:g} {first.time_unit}" for x in (episode_1, episode_2)]
         advice = "; give a number of steps for both" if episode_1.control_interval == episode_2.control_interval else ""
-        yield f"horizon {value_1} and {value_2}{advice}"
+        yield f"horizon {' and '.join(lengths)}{advice}"

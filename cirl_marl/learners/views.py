@@ -196,9 +196,8 @@ class AllAtOnce(View):
         boxes = [env.observation_spaces[agent] for agent in self.agents]
         lengths = [env.action_spaces[agent].shape[0] for agent in self.agents]
         self._ends = np.cumsum(lengths)
-        self.observation_space = spaces.Box(
-            np.concatenate([box.low for box in boxes]), np.concatenate([box.high for box in boxes]), dtype=np.float32
-        )
+        low, high = (np.concatenate([getattr(box, end) for box in boxes]) for end in ("low", "high"))
+        self.observation_space = spaces.Box(low, high, dtype=np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (int(self._ends[-1]),), dtype=np.float32)
 
     def rows(self, observations: Arrays) -> NDArray[np.floating]:

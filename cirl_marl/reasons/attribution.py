@@ -138,9 +138,8 @@ def _integrated_gradients(
     from cirl_marl.learners.policies import DifferentiablePolicy
 
     function, view, columns = DifferentiablePolicy(policy), policy.view, policy_columns(env, policy.view, agent)
-    flat: dict[str, Floats] = {
-        member: record.observations[member].reshape(-1, record.observations[member].shape[2]) for member in view.agents
-    }
+    observations = {member: record.observations[member] for member in view.agents}
+    flat: dict[str, Floats] = {member: rows.reshape(-1, rows.shape[2]) for member, rows in observations.items()}
     count = len(flat[agent])
     place = view.row_agents.index(agent) if view.row_agents else 0
     rows = np.asarray(view.rows(flat), dtype=np.float32)[place * count : (place + 1) * count]

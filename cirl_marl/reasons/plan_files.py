@@ -141,10 +141,8 @@ class _TableController(Controller):
     def act(self, observations: Arrays) -> Arrays:
         step = np.array([self._step])
         self._step += 1
-        return {
-            agent: self._actuators.normalise(agent, self._values[entries][:, step], step).T
-            for agent, entries in self._actuators.entries.items()
-        }
+        values, entries = self._values[:, step], self._actuators.entries
+        return {agent: self._actuators.normalise(agent, values[rows], step).T for agent, rows in entries.items()}
 
 
 def _carry_out(network: Network, table: _Table, seed: int | None) -> PlannedEpisode:

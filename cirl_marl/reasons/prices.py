@@ -109,14 +109,10 @@ def shadow_prices(
             progress(next(shares))
     # the last rows of the program hold each service to its level
     demands = 0 if best.min_service is None else services
-    level = best.certificate.under[len(best.certificate.under) - services :]
-    return ShadowPrices(
-        bound=best,
-        stock=stock_values(programs, best.problem, best.certificate, demands=demands),
-        demand=demand,
-        level=np.minimum(level, 0.0) if best.min_service is not None else np.zeros(services),
-        room=room,
-    )
+    last = best.certificate.under[len(best.certificate.under) - services :]
+    level = np.minimum(last, 0.0) if best.min_service is not None else np.zeros(services)
+    stock = stock_values(programs, best.problem, best.certificate, demands=demands)
+    return ShadowPrices(bound=best, stock=stock, demand=demand, level=level, room=room)
 
 
 def _slope(best: Bound, admissible: Admissible, variant: Admissible) -> Floats:

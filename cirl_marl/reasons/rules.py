@@ -162,14 +162,9 @@ def distil_rules(
     for a, agent in enumerate(env.agents):
         episodes = rollout(env, Substitution(policies, controller, [agent]), seed=seed)
         tree, lesson = fitted_trees[agent], lessons[agent]
-        rules.append(
-            Rule(
-                agent=agent,
-                leaves=_leaves(env, agent, tree, columns[agent].names, lesson),
-                explained_variance=_explained_variance(tree, lesson),
-                cost=paired_difference(episodes, usual),
-            )
-        )
+        tree_leaves = _leaves(env, agent, tree, columns[agent].names, lesson)
+        explained, cost = _explained_variance(tree, lesson), paired_difference(episodes, usual)
+        rules.append(Rule(agent=agent, leaves=tree_leaves, explained_variance=explained, cost=cost))
         progress((ROUNDS + 2 + a) / work)
     together = paired_difference(rollout(env, controller, seed=seed), usual)
     progress(1.0)

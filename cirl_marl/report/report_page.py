@@ -90,10 +90,9 @@ class ReportPage:
 def page_of_alternatives(simulations: Sequence[Simulation]) -> ReportPage:
     """Return the page of ``cirl simulate``."""
     network, note = simulations[0].network, f"Start: {simulations[0].episode_start.description}."
-    episodes = tuple(
-        _episode(case.name or readable(case.control), case.network, case.env.agents, case.rollout)
-        for case in simulations
-    )
+    names = (case.name or readable(case.control) for case in simulations)
+    cases = zip(names, simulations, strict=True)
+    episodes = tuple(_episode(name, case.network, case.env.agents, case.rollout) for name, case in cases)
     return ReportPage(_title(network), network, episodes, notes=(note,))
 
 

@@ -101,9 +101,8 @@ class Copies:
         last = {name: by_part(np.copy, rows) for name, rows in self._observations.items()}
         for i, env in enumerate(self.envs):
             actors = [name for name in self.agents if before[name][i]]
-            observations, copy_rewards, terminations, truncations, infos = env.step(
-                {self._native_names[name]: _action(self.action_spaces[name], actions[name][i]) for name in actors}
-            )
+            chosen = {self._native_names[n]: _action(self.action_spaces[n], actions[n][i]) for n in actors}
+            observations, copy_rewards, terminations, truncations, infos = env.step(chosen)
             for name in actors:
                 native, place = self._native_names[name], self._place[name]
                 try:
