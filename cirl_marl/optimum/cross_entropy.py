@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -127,19 +127,9 @@ def search(
     elif initial is not None:
         initial_state = by_state_name(env, np.asarray(initial, dtype=float)[None])
     env.reset(seed=EVALUATION_SEEDS, options={"initial_state": initial_state})
-    return search_each(
-        env.network,
-        starting_states(env),
-        service_weight=service_weight,
-        min_service=min_service,
-        agents=agents,
-        candidates=candidates,
-        knots=knots,
-        population=population,
-        iterations=iterations,
-        seed=seed,
-        progress=progress,
-    )[0]
+    options: dict[str, Any] = {"service_weight": service_weight, "min_service": min_service, "agents": agents}
+    options |= {"candidates": candidates, "knots": knots, "population": population, "iterations": iterations}
+    return search_each(env.network, starting_states(env), **options, seed=seed, progress=progress)[0]
 
 
 def search_each(
