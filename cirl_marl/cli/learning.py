@@ -75,11 +75,8 @@ def train(
         _only_resume(context)
     options: dict[str, Any] = {"steps": steps, "envs": envs, "scenario": scenario, "reward": reward, "engine": engine}
     options |= {"min_service": min_service, "uncertain": uncertain, "checkpoint_every": checkpoint_every}
-    options |= {
-        "observe": observe,
-        "agents": None if agents is None else common.comma_separated(agents),
-        "device": device,
-    }
+    names = None if agents is None else common.comma_separated(agents)
+    options |= {"observe": observe, "agents": names, "device": device}
     all_seeds = range(seed, seed + seeds)
     directories = [resume] if resume is not None else _directories(out, str(network), recipe, all_seeds)
     with common.training_bar() as report:

@@ -8,6 +8,7 @@ import time as clock
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -59,13 +60,8 @@ def sweep(
     options: dict[str, Any] = {"on": on, "workers": workers, "out": out, "settings": _settings(slurm or [])}
     try:
         with _live(as_json) as watch:
-            outcome = swept(
-                file,
-                **options,
-                checkpoint_every=checkpoint_every,
-                watch=watch,
-                say=lambda line: printer.print(line, soft_wrap=True, highlight=False, markup=False),
-            )
+            say = partial(printer.print, soft_wrap=True, highlight=False, markup=False)
+            outcome = swept(file, **options, checkpoint_every=checkpoint_every, watch=watch, say=say)
     except KeyboardInterrupt:
         place = out or Path("runs") / f"sweep-{file.stem}"
         message = f"\nstopped; everything learnt is kept in {place}. The same command goes on."

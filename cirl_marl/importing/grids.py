@@ -131,7 +131,6 @@ class Grid:
 
 
 def _without_blanks(block: Block) -> Block:
-    """Return a block without rows of blanks."""
     lines, rows = block
     if all(map(str.strip, map(itemgetter(0), rows))):
         return block

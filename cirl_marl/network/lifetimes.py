@@ -146,7 +146,6 @@ def chain_of(distribution: str, deviation: float) -> Chain:
 
 
 def _closest_chain(stages: int, ages: Floats, target: Floats, mean: float) -> Chain:
-    """Return the closest chain of so many stages."""
     rates, chains = np.geomspace(0.2, 1.0, 12) * stages / mean, []
     for _ in range(2):  # then once more, finer, around the best
         chains += [_fit_chain(stages, float(rate), ages, target, mean) for rate in rates]

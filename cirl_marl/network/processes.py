@@ -203,8 +203,6 @@ class DisturbanceProcesses:
 
 
 class _Chain:
-    """A Markov chain."""
-
     def __init__(self, chain: Markov) -> None:
         self.values, self._matrix = np.array(chain.values), chain.transitions
         shares = chain.stationary

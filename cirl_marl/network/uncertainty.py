@@ -102,7 +102,6 @@ def factor_ranges(network: Specification, *, with_draws: bool) -> dict[str, tupl
 
 
 def _factor_range(network: Specification, path: str, *, with_draws: bool = True) -> tuple[float, float]:
-    """Return the lowest and the highest factor on a number."""
     low, high = network.uncertain[path].ends if with_draws and path in network.uncertain else CERTAIN
     if path not in network.disturbed:
         return low, high
@@ -380,6 +379,5 @@ def _number(part: Any, name: str) -> Value:
 
 
 def _split(path: str) -> tuple[str, str, str]:
-    """Return kind, id and field of a path."""
     kind, id_, name = [*path.split(".", 2), "", ""][:3]
     return kind, id_, name

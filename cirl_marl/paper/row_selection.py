@@ -57,7 +57,6 @@ def _environments(name: str | None) -> list[PaperEnvironment]:
 
 
 def _published_rows(environment: str | None, algorithm: str | None) -> Iterator[tuple[PaperEnvironment, str]]:
-    """Yield the paper's own runs."""
     for rows in _environments(environment):
         if environment is not None and algorithm not in (None, *rows.runs):
             raise CirlError(f"the paper did not run {algorithm} on {rows.name}; it ran {', '.join(rows.runs)}")

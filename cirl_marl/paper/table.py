@@ -105,7 +105,6 @@ def _paper_row(environment: PaperEnvironment, algorithm: str, run: PublishedRun)
 
 
 def _above(environment: PaperEnvironment, figures: Mapping[str, float | None]) -> str:
-    """Name the figures above the optimum."""
     match = [name for name, value in figures.items() if above_optimum(environment, value)]
     return f"{', '.join(match)} above the optimum" if match else ""
 

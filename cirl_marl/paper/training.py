@@ -125,7 +125,6 @@ def train_tuned(
 def _train_network(
     environment: PaperEnvironment, recipe: Recipe, row: PaperRow, report: Report, settings: dict[str, Any]
 ) -> TrainingRecord:
-    """Train the one agent of a network in its paper scenario."""
     arguments = check_registered(environment).kwargs
     agent = arguments.get("agent")
 

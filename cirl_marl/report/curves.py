@@ -211,7 +211,6 @@ def _widen(axes: Axes) -> None:
 
 
 def _check_length(name: str, values: Floats, time: Floats) -> Floats:
-    """Check that the last axis of ``values`` is that of ``time``."""
     numbers = np.asarray(values, dtype=float)
     if numbers.ndim not in (1, 2) or numbers.shape[-1] != len(time):
         raise CirlError(f"'{name}' has shape {numbers.shape}, expected {len(time)} along the last axis")

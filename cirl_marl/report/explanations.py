@@ -120,7 +120,6 @@ def _interval(aggregate: Aggregate) -> str:
 
 
 def _price_rows(explanation: Explanation) -> Rows:
-    """Yield a table with a row for each price in each interval."""
     yield ["more of", "compartment or service", "interval", "rise of λ̄", "unit"]
     if explanation.prices is None:
         return
@@ -157,7 +156,6 @@ def _input_rows(explanation: Explanation) -> Rows:
 
 
 def _rule_rows(explanation: Explanation) -> Rows:
-    """Yield a table with a row for each leaf of each agent's rule."""
     outcome = (name.format(explanation.network.mass_unit) for name in OUTCOME)
     yield ["agent", "when", "what", "control", "share of decisions", "variance explained", *outcome]
     if explanation.rules is None:

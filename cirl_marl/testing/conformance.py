@@ -127,8 +127,6 @@ class _Actions:
 
 
 class _CheckedEnv:
-    """An environment whose every return is checked."""
-
     def __init__(self, env: AnyEnv) -> None:
         self.env = env
         self._spaces: dict[Any, tuple[spaces.Space[Any], spaces.Space[Any]]] = {}

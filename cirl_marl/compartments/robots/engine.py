@@ -133,7 +133,6 @@ class Robot(DiscreteTimeModel):
 
 
 def _welded_bodies(model: Any) -> list[int]:
-    """Return the bodies that are welded to a mocap body."""
     bodies = []
     for kind, first, second in zip(model.eq_type, model.eq_obj1id, model.eq_obj2id, strict=True):
         if kind == mujoco.mjtEq.mjEQ_WELD:

@@ -145,7 +145,6 @@ def _end_problems(node: Node, arcs: Sequence[Arc]) -> Iterator[str]:
 
 
 def _spread_problems(network: Specification, lifetime: Lifetime) -> Iterator[str]:
-    """Yield why a lifetime cannot be followed."""
     mean, deviation, interval = lifetime.mean, lifetime.deviation, network.episode.control_interval
     if lifetime.distribution == FIXED_LIFETIME:
         if deviation is not None:
