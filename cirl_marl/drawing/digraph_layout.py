@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections import Counter
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -10,6 +9,7 @@ from functools import lru_cache
 import numpy as np
 
 from cirl_marl.drawing.placement import place_nodes
+from cirl_marl.drawing.style import label_lines
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import Role
 
@@ -79,19 +79,13 @@ class _Structure:
 @lru_cache(maxsize=16)
 def _layout(structure: _Structure, aspect: float) -> DigraphLayout:
     network = structure.network
-    names = tuple(_lines(node.label) for node in network.nodes)
+    names = tuple(label_lines(node.label, LINE_LETTERS) for node in network.nodes)
     letters = max(len(line) for name in names for line in name)
     box = np.array([max(5.5, 0.62 * letters + 1.0), 1.2 * (max(map(len, names)) + 1) + 0.6])
     positions = place_nodes(network, box + np.array([4.8, 3.7]), aspect)
     has_labels = len(network.nodes) <= LABELLED_NODES and len(network.arcs) <= LABELLED_ARCS
     routes = route(positions, network.donors, network.recipients, box) if has_labels else None
     return DigraphLayout(positions, routes, box, names)
-
-
-def _lines(label: str) -> tuple[str, ...]:
-    """Break a label into lines at its spaces."""
-    lines = textwrap.wrap(label, LINE_LETTERS, break_long_words=False, break_on_hyphens=False)
-    return tuple(lines) or ("",)
 
 
 def bezier(start: Floats, end: Floats, bend: Floats, points: int) -> Floats:

@@ -5,7 +5,6 @@ Large networks are folded by group: one diagram shows the groups and what runs b
 
 from __future__ import annotations
 
-import textwrap
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from typing import Annotated
 import numpy as np
 
 from cirl_marl.drawing.layered import LayeredLayout, layered_layout
-from cirl_marl.drawing.style import readable
+from cirl_marl.drawing.style import label_lines, readable
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Role
@@ -80,7 +79,7 @@ def arrange_boxes(
     """Find the places of boxes and ribbons whose arcs carry at most ``peaks``; in ``layers``, if they are given."""
     most = np.array([peaks[list(ribbon.members)].sum() for ribbon in ribbons])
     donors, recipients = (np.array([getattr(r, end) for r in ribbons], dtype=np.intp) for end in ("donor", "recipient"))
-    caption = LINE * (1 + max((len(lines(box.label, HORIZONTAL)) for box in boxes), default=0))
+    caption = LINE * (1 + max((len(label_lines(box.label, LETTERS[HORIZONTAL])) for box in boxes), default=0))
     weaves, breadths, scales = {}, {}, {}
     for way in (HORIZONTAL, VERTICAL):
         through = _through(len(boxes), donors, recipients, most)
@@ -90,11 +89,6 @@ def arrange_boxes(
         whole = breadths[way] + (caption if way == HORIZONTAL else 0.0)
         weaves[way] = layered_layout(donors, recipients, scales[way] * most, whole, CLEARANCE[way], layers)
     return FlowDiagram(group, tuple(boxes), tuple(ribbons), weaves, breadths, scales, caption)
-
-
-def lines(label: str, way: str) -> tuple[str, ...]:
-    """Break a label into lines at its spaces."""
-    return tuple(textwrap.wrap(label, LETTERS[way], break_long_words=False, break_on_hyphens=False)) or ("",)
 
 
 def _through(count: int, donors: Integers, recipients: Integers, most: Floats) -> Floats:

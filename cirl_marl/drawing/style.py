@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -66,6 +67,11 @@ def check_shape(name: str, values: Floats, shape: tuple[int, ...]) -> Floats:
     if numbers.shape != shape:
         raise CirlError(f"{name} has shape {numbers.shape}, expected {shape}")
     return numbers
+
+
+def label_lines(label: str, letters: int) -> tuple[str, ...]:
+    """Break a label at its spaces into lines of so many letters."""
+    return tuple(textwrap.wrap(label, letters, break_long_words=False, break_on_hyphens=False)) or ("",)
 
 
 def readable(identifier: str) -> str:

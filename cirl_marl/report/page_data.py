@@ -12,8 +12,9 @@ import numpy as np
 from cirl_marl.controllers.rollout import interval_ends
 from cirl_marl.definitions.sources import StatedNumber, stated_numbers
 from cirl_marl.definitions.writer import fingerprint
-from cirl_marl.drawing.flow_diagram import FlowDiagram, flow_diagrams, lines
+from cirl_marl.drawing.flow_diagram import LETTERS, FlowDiagram, flow_diagrams
 from cirl_marl.drawing.layered import RibbonRoute
+from cirl_marl.drawing.style import label_lines
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.statistics import Aggregate
 from cirl_marl.network import Floats, Network
@@ -186,7 +187,7 @@ def _diagram(diagram: FlowDiagram) -> Values:
                 [int(layer), _pixels(middle), _pixels(breadth)]
                 for layer, middle, breadth in zip(layout.layers, layout.middles, diagram.breadths[name], strict=True)
             ],
-            "labels": [list(lines(box.label, name)) for box in diagram.boxes],
+            "labels": [list(label_lines(box.label, LETTERS[name])) for box in diagram.boxes],
             "courses": [_route(route) for route in layout.routes],
         }
         for name, layout in diagram.layouts.items()
