@@ -73,7 +73,7 @@ def is_plain(value: object) -> bool:
 
 
 def require_alike(value: Any, template: Any, place: str) -> None:
-    """Raise a ``RunError`` that names the place where a tree has other keys, lengths, types or shapes than ``template``."""
+    """Raise a ``RunError`` that names where a tree has other keys, lengths, types or shapes than ``template``."""
     if isinstance(template, Mapping):
         if not isinstance(value, Mapping) or set(value) != set(template):
             raise RunError(f"{place} is no table of {', '.join(map(str, template))}")
