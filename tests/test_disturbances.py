@@ -639,6 +639,31 @@ def test_the_command_shows_what_happened(tmp_path: Path) -> None:
     np.testing.assert_allclose(found, samples[:, names.index("record")].mean(axis=0))
 
 
+def test_what_stands_still_throughout_can_be_drawn() -> None:
+    """A rate that is disturbed to 0 in all intervals of a short horizon is 0 in the network of that path."""
+    network = line(EVERYWHERE).with_options(episode={"horizon": 2})
+    path = np.ones((2, len(network.processes.names)))
+    path[:, network.processes.names.index("outage")] = 0.0
+    env = MultiAgentVectorEnv(draw_network(network, (), path), num_envs=1)
+    still = rollout(env, Neutral(), seed=0)
+    assert (still.flow[:, env.network.arc_index["leak"]] == 0).all() and (still.flow > 0).any()
+    with pytest.raises(CirlError, match="arc 'leak': law 'donor' needs a positive rate"):
+        replace(network, arcs=tuple(replace(a, rate=0.0) if a.id == "leak" else a for a in network.arcs), disturbed={})
+
+
+def test_a_scenario_may_have_a_disturbance_of_another_kind(tmp_path: Path) -> None:
+    """Its table takes the place of the other, and who alone sees it stands in the table of disturbances."""
+    path = tmp_path / "line.toml"
+    write_network(line(EVERYWHERE), path)
+    table = '[scenarios.stops.disturbances.price]\nkind = "markov"\nvalues = [1, 0.5]\nlengths = [4, 2]\n'
+    path.write_text(f'{path.read_text()}\n{table}unit = "1"\nsource = "x"\nobserved_by = ["leak"]\n')
+    network = load_network(path, scenario="stops")
+    assert network.disturbances["price"] == Markov(values=(1.0, 0.5), lengths=(4.0, 2.0), observed_by=("leak",))
+    assert network.disturbed == load_network(path).disturbed
+    shown = CliRunner().invoke(app, ["show", str(path), "--scenario", "stops"])
+    assert re.search(r"price +│ markov +│ +0.5 … 1 +│ now, by leak", shown.output)
+
+
 @pytest.mark.medium
 def test_the_worst_episodes_are_told(tmp_path: Path) -> None:
     """CVaR with a fraction of an episode, its interval, and that of every policy in tables and files."""

@@ -17,10 +17,10 @@ from typer.testing import CliRunner
 
 from cirl_marl import CirlError, fit_disturbances, load_network, write_network
 from cirl_marl.cli import app
-from cirl_marl.importing.autoregression import autoregression
+from cirl_marl.importing.autoregression import Autoregression, autoregression
 from cirl_marl.network.disturbances import AutoRegression, BlockBootstrap, Markov, Seasonal
 
-Floats = NDArray[np.floating]
+Floats = NDArray[np.float64]
 
 
 def reverting(persistence: float, noise: Floats) -> Floats:
@@ -56,6 +56,23 @@ def test_noise_around_a_trend_is_found_within_its_errors(count: int, persistence
         assert np.median(errors) == pytest.approx(found.std(), rel=0.25)
     slopes = np.array([(e.coefficients[1], e.coefficient_errors[1]) for e in estimates])
     assert 0.87 < np.mean(np.abs(slopes[:, 0] - slope) < 1.96 * slopes[:, 1]) < 0.98
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize(("count", "persistence"), [(25, 0.8), (25, 0.3), (60, 0.8)])
+def test_intervals_of_deviations_hold_in_short_series(count: int, persistence: float) -> None:
+    """Of many series around a trend, all but some 5 in 100 hold the truth, which standard errors do not."""
+    rng, found = np.random.default_rng(11), list[Autoregression]()
+    design = np.column_stack([np.ones(count), np.arange(float(count))])
+    while len(found) < 250:
+        try:
+            found.append(autoregression(reverting(persistence, rng.normal(size=count)), design))
+        except CirlError:  # looks like a random walk
+            continue
+    low, high = np.array([estimate.deviation_interval for estimate in found]).T
+    assert 0.91 < np.mean((low < 1) & (high > 1)) < 0.99
+    best = np.array([estimate.deviation for estimate in found])
+    assert (low < best).all() and (best < high).all() and np.mean(high / best > best / low) > 0.9
 
 
 def test_the_likelihood_is_that_of_what_the_regression_leaves() -> None:
@@ -117,6 +134,9 @@ def test_columns_that_vary_together_and_their_definition(tmp_path: Path) -> None
     text = tomllib.loads(fits.tables())["disturbances"]["demand"]["source"]
     assert text.startswith("cirl fit prices.csv --column 'Copper price' --column demand (made up); 400 rows, 1950 to")
     assert f"persistence ± {fits.errors['demand']['persistence']:.2g}" in text
+    assert text.endswith("95 % of deviation: {:.2g} to {:.2g}".format(*fits.intervals["demand"]))
+    estimate = autoregression(np.log(demand), np.column_stack([np.ones(400), years - years.mean()]))
+    assert fits.intervals["demand"] == pytest.approx(estimate.deviation_interval, rel=1e-6)
 
 
 def test_factors_and_summands_of_the_values_themselves(tmp_path: Path) -> None:

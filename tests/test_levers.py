@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,8 @@ from typer.testing import CliRunner
 import cirl_marl
 from cirl_marl import Arc, CirlError, Control, ControlKind, Episode, Network, Node, Role, load_network
 from cirl_marl.cli import app
-from cirl_marl.evaluation.levers import SHORT, LeverRow, _agents_by_lever
+from cirl_marl.evaluation.levers import SETTLED, SHORT, LeverRow, _agents_by_lever
+from cirl_marl.optimum.bounds import Bound, bound
 from cirl_marl.report.lever_chart import LEVER_FILES
 
 STOCKS, RATES, STEPS = {"glass": 40.0, "paper": 100.0, "metal": 10.0}, {"glass": 0.1, "paper": 0.2, "metal": 0.3}, 4
@@ -73,6 +75,19 @@ def test_levers_that_meet_keep_the_service() -> None:
             assert trial.bound is not None and trial.circularity <= trial.bound + 0.01 * abs(trial.bound)
             assert trial.bound <= result.plan.objective + 1e-6 * abs(trial.bound)
     assert result.rows[-1].added.circularity == result.together.circularity
+    order, left = list[str](), {row.name: set(row.agents) for row in result.rows}
+    value, whole = result.usual.circularity, result.plan.objective
+    while left and whole - value > SETTLED * (whole - result.usual.circularity):
+        values = {}
+        for name in left:
+            agents = set[str]().union(*(row.agents for row in result.rows if row.name in (name, *order)))
+            values[name] = bound(
+                network, min_service=demand, agents=[a for a in network.agents if a in agents]
+            ).objective
+        order.append(max(values, key=lambda name: values[name]))
+        value = values[order[-1]]
+        del left[order[-1]]
+    assert [row.name for row in result.rows][: len(order)] == order
     best = max(result.rows, key=lambda row: row.alone.circularity)
     assert result.rows[0].added.circularity == pytest.approx(best.alone.circularity, rel=0.01)
 
@@ -120,10 +135,33 @@ def test_command(tmp_path: Path) -> None:
     assert "needs a name and agents, as in scrap=old_scrap,new_scrap" in str(outcome.exception)
 
 
-def test_many_levers_share_a_row_of_the_chart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The chart goes up to λ̄ of all levers, though it names only some of them."""
-    monkeypatch.setattr("cirl_marl.report.lever_chart.SHOWN", 2)
-    result = cirl_marl.levers(heaps(), bounds=False)
-    assert isinstance(result.rows[0], LeverRow)
+def test_late_levers_share_a_row(tmp_path: Path) -> None:
+    """They are one lever in the last of so many rows, of table and chart, and the command says which."""
+    result = cirl_marl.levers(heaps(), most=2)
+    assert [row.name for row in result.rows] == ["paper lost", "2 others"]
+    assert {*result.rows[1].agents} == {"glass_lost", "metal_lost"}
+    assert result.changes(1) == pytest.approx([saved("glass") + saved("metal")] * 3, rel=1e-6)
     assert cirl_marl.draw(tmp_path / "levers.png", result).stat().st_size > 10_000
-    assert "paper lost" in cirl_marl.summarise(result).columns[0]._cells  # type: ignore[union-attr]
+    assert isinstance(result.rows[0], LeverRow)
+    assert "2 others" in cirl_marl.summarise(result).columns[0]._cells  # type: ignore[union-attr]
+    with pytest.raises(CirlError, match="most must be at least 2, got 1"):
+        cirl_marl.levers(heaps(), most=1)
+
+
+def test_bounds_are_solved_where_they_decide(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lever that does next to nothing is tried once, and still stands in its place with what it brings."""
+    monkeypatch.setitem(STOCKS, "dust", 1e-4)
+    monkeypatch.setitem(RATES, "dust", 0.2)
+    solved: list[set[str]] = []
+
+    def counted(*args: object, agents: Sequence[str], **options: object) -> Bound:
+        solved.append({agent.removesuffix("_lost") for agent in agents})
+        return bound(*args, agents=agents, **options)  # type: ignore[call-overload, no-any-return]
+
+    monkeypatch.setattr("cirl_marl.evaluation.levers.bound", counted)
+    result = cirl_marl.levers(heaps())
+    assert [row.name.split()[0] for row in result.rows] == ["paper", "glass", "metal", "dust"]
+    for place, row in enumerate(result.rows):
+        assert result.changes(place) == pytest.approx([saved(row.name.split()[0])] * 3, rel=1e-4)
+    with_dust = {frozenset(agents) for agents in solved if "dust" in agents}
+    assert with_dust == {frozenset({"dust"}), *(frozenset(STOCKS) - {name} for name in ("", "paper", "glass", "metal"))}

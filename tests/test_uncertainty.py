@@ -582,6 +582,13 @@ def test_the_command_writes_bands_and_causes(tmp_path: Path) -> None:
     with (tmp_path / "metal_cycle_neutral_causes.csv").open(newline="") as file:
         (first, *_) = list(csv.DictReader(file))
     assert first["number"] == "arcs.dross.share" and float(first["share of λ̄"]) > 0.8
+    (line,) = [line for line in run.output.splitlines() if line.startswith("λ̄: ")]
+    median, low, high, mean = map(float, re.findall(r"-?\d[\d.e+-]*(?=[ ,\]])", line.replace("95 % of", "")))
+    assert low < median < high and "median" in line.split(",")[0] and line.index("95 %") < line.index("; mean")
+    with (tmp_path / "metal_cycle_neutral_draws.csv").open(newline="") as file:
+        found = [float(row["mean circularity (Mt)"]) for row in csv.DictReader(file)]
+    np.testing.assert_allclose([low, median, high], np.quantile(found, (0.025, 0.5, 0.975)), rtol=1e-4)
+    assert mean == pytest.approx(np.mean(found), rel=1e-4)
     for arguments, said in (
         (["copper_net", "--samples", "80"], "nothing is uncertain"),
         (

@@ -30,6 +30,8 @@ cirl train copper_net --seed 0 · cirl report RUN --html page.html
 # Written out, as the modules that know them take longer to import than all else of ``cirl --help``; a test compares.
 CONTROLLERS = "neutral, constant, random, scripted, lqr, mpc, optimum"
 REWARDS = "local, circularity, mixed, difference, mixed_difference, local_sum, team"
+LINE_SECONDS = 30.0
+"""Between two lines of progress without a terminal."""
 OBSERVE = "local, neighbours, full, stocks, model"
 
 app = typer.Typer(
@@ -170,13 +172,33 @@ def bar(task: str) -> Iterator[Callable[[float], None]]:
 
 @contextmanager
 def shares() -> Iterator[Callable[[str, float], None]]:
-    """Progress bar of several things; the yielded function takes what is being done and the share of all done."""
+    """Progress of several things; the yielded function takes what is being done and the share of all done.
+
+    It is a bar with the time left, or without a terminal a line now and then.
+    """
+    if not console.is_terminal:
+        yield _share_lines()
+        return
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+    with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task("preparing", total=1.0)
         yield lambda activity, share: progress.update(task, description=activity, completed=share)
+
+
+def _share_lines() -> Callable[[str, float], None]:
+    """Return what says, every LINE_SECONDS, what is being done, the share that is done, and how long the rest takes."""
+    began = latest = clock.perf_counter()
+
+    def update(activity: str, share: float) -> None:
+        nonlocal latest
+        now = clock.perf_counter()
+        if now - latest >= LINE_SECONDS and 0 < share < 1:
+            latest = now
+            say(f"{activity}: {share:.0%} done, some {(now - began) * (1 / share - 1):,.0f} s left")
+
+    return update
 
 
 @contextmanager

@@ -142,6 +142,9 @@ def levers(
         bool | None,
         typer.Option(help="Whether the bound of each row is solved; default: unless the network is large."),
     ] = None,
+    most: Annotated[
+        int, typer.Option(min=2, help="Most rows; levers that would come later are one lever in the last of them.")
+    ] = 24,
     out: Annotated[
         Path | None, typer.Option(help="Folder of levers.csv, .json, .png; default: runs/levers-NETWORK[_SCENARIO].")
     ] = None,
@@ -157,7 +160,7 @@ def levers(
     groups = dict(_group(text) for text in group or ())
     variant = load_network(network, scenario=scenario)
     folder = common.folder_for(out or Path("runs") / f"levers-{common.stem(variant)}", "--out")
-    options: dict[str, Any] = {"groups": groups, "min_service": min_service, "bounds": bounds}
+    options: dict[str, Any] = {"groups": groups, "min_service": min_service, "bounds": bounds, "most": most}
     with common.shares() as progress:
         result = levers_of(variant, progress=progress, **options)
     common.console.print(levers_table(result))

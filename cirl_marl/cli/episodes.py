@@ -83,6 +83,7 @@ def _sample(
     import numpy as np
 
     from cirl_marl.definitions.catalogue import load_network
+    from cirl_marl.definitions.reader import DEFAULT
     from cirl_marl.evaluation.sampling import FEWEST, rbd_fast, sample_episodes, sensitivities
     from cirl_marl.report.samples import sensitivity_table, write_samples
 
@@ -96,7 +97,8 @@ def _sample(
     with common.bar("sampling") as progress:
         episodes = sample_episodes(network, samples=samples, control=controls[0], seed=seed, progress=progress)
     causes = sensitivities(episodes) if samples >= FEWEST else []
-    title = f"{network.title or network.name}, {controls[0]} control, {samples} samples"
+    scenario = "" if network.scenario_name == DEFAULT else f", scenario {network.scenario_name}"
+    title = f"{network.title or network.name}{scenario}, {controls[0]} control, {samples} samples"
     paths = write_samples(folder, common.stem(network, controls[0]), episodes, causes, title=title)
     # a few bad samples draw the mean out of the interval, so that the median stands beside it
     figures = [("λ̄", f" {network.mass_unit}", ".5g", episodes.circularity.mean(axis=1))]

@@ -13,15 +13,16 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date
-from operator import itemgetter
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, overload
 
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network.calendar import YearOrDate
 from cirl_marl.records.files import LARGEST, read_content
 
 T = TypeVar("T")
+CsvRow = str | list[str]
+"""The cells of a row, or its line, in which commas separate them."""
 Block = tuple[Sequence[int], list[list[str]]]
 """Rows of a table, with the numbers of the lines on which they end."""
 BLOCK = 2048
@@ -57,9 +58,17 @@ def no_collection() -> Iterator[None]:
 
 def csv_blocks(subject: str, content: bytes) -> Iterator[Block]:
     """Yield the rows of a CSV file that are not empty, some thousands at a time; a ``CirlError`` if it is none."""
+    for lines, rows in _blocks(subject, content):
+        yield lines, [row.split(",") if isinstance(row, str) else row for row in rows]
+
+
+def _blocks(subject: str, content: bytes) -> Iterator[tuple[Sequence[int], Sequence[CsvRow]]]:
+    """Yield the same rows, those of a file without quotes as the texts of their lines."""
+    blocks: Iterator[tuple[Sequence[int], Sequence[CsvRow]]]
+    blocks = _quoted_blocks(content) if b'"' in content else _plain_blocks(content)
     try:
-        for lines, rows in _quoted_blocks(content) if b'"' in content else _plain_blocks(content):
-            if [] in rows:
+        for lines, rows in blocks:
+            if not all(rows):
                 lines = [number for number, row in zip(lines, rows, strict=True) if row]
                 rows = [row for row in rows if row]
             yield lines, rows
@@ -67,12 +76,12 @@ def csv_blocks(subject: str, content: bytes) -> Iterator[Block]:
         raise CirlError(f"{subject}: is no CSV file in UTF-8: {error}") from error
 
 
-def _plain_blocks(content: bytes) -> Iterator[Block]:
-    """Yield the rows of a file without quotes, in which every comma separates cells and every line is a row."""
+def _plain_blocks(content: bytes) -> Iterator[tuple[Sequence[int], Sequence[CsvRow]]]:
+    """Yield the lines of a file without quotes, in which every comma separates cells and every line is a row."""
     stream, line = io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig"), 1
     while text := stream.read(CHARACTERS):
         texts = (text + stream.readline()).removesuffix("\n").split("\n")
-        yield range(line, line + len(texts)), [row.split(",") if row else [] for row in texts]
+        yield range(line, line + len(texts)), texts
         line += len(texts)
 
 
@@ -89,29 +98,67 @@ def _quoted_blocks(content: bytes) -> Iterator[Block]:
         yield lines, rows
 
 
-def csv_rows(subject: str, content: bytes) -> Block:
-    """Return the rows of a CSV file that are not empty, with their lines.
+class CsvRows(Sequence[list[str]]):
+    """The rows of a CSV file that are not empty; those of a file without quotes are texts until they are asked for.
 
-    Raises:
-        CirlError: if it is no CSV file, there are no rows, or one is not as long as the first.
+    Attributes:
+        lines: on which they end.
     """
-    lines: list[int] = []
-    rows: list[list[str]] = []
-    with no_collection():
-        for block_lines, block_rows in csv_blocks(subject, content):
-            lines += block_lines
-            rows += block_rows
-    if not rows:
-        raise CirlError(f"{subject}: is empty; its first line names the columns")
-    check_lengths(subject, lines, rows, len(rows[0]))
-    return lines, rows
+
+    def __init__(self, subject: str, content: bytes) -> None:
+        """Read them.
+
+        Raises:
+            CirlError: if it is no CSV file, there are no rows, or one is not as long as the first.
+        """
+        self.lines: list[int] = []
+        self._rows: list[CsvRow] = []
+        width = 0
+        with no_collection():
+            for lines, rows in _blocks(subject, content):
+                width = width or _width(rows[0])
+                check_lengths(subject, lines, rows, width)
+                self.lines += lines
+                self._rows += rows
+        if not width:
+            raise CirlError(f"{subject}: is empty; its first line names the columns")
+
+    def __len__(self) -> int:
+        """Count them, the header too."""
+        return len(self._rows)
+
+    @overload
+    def __getitem__(self, i: int) -> list[str]: ...
+
+    @overload
+    def __getitem__(self, i: slice) -> list[list[str]]: ...
+
+    def __getitem__(self, i: int | slice) -> list[str] | list[list[str]]:
+        """Return the cells of a row, or of several."""
+        if isinstance(i, slice):
+            return [self[place] for place in range(*i.indices(len(self)))]
+        row = self._rows[i]
+        if isinstance(row, str):
+            self._rows[i] = row = row.split(",")
+        return row
+
+    def columns(self, places: Sequence[int]) -> Iterator[tuple[str, ...]]:
+        """Yield the cells of some columns of the rows below the header."""
+        last = max(places, default=0) + 1
+        for row in itertools.islice(self._rows, 1, None):
+            cells = row.split(",", last) if isinstance(row, str) else row
+            yield tuple([cells[place] for place in places])
 
 
-def check_lengths(subject: str, lines: Sequence[int], rows: Sequence[Sequence[str]], width: int) -> None:
+def _width(row: CsvRow) -> int:
+    return row.count(",") + 1 if isinstance(row, str) else len(row)
+
+
+def check_lengths(subject: str, lines: Sequence[int], rows: Sequence[CsvRow], width: int) -> None:
     """Raise a ``CirlError`` if a row has not as many cells as there are columns."""
-    if not set(map(len, rows)) <= {width}:
-        line, row = next((line, row) for line, row in zip(lines, rows, strict=True) if len(row) != width)
-        raise CirlError(f"{subject}, line {line}: {len(row)} cells in {width} columns")
+    if not set(map(_width, rows)) <= {width}:
+        line, row = next((line, row) for line, row in zip(lines, rows, strict=True) if _width(row) != width)
+        raise CirlError(f"{subject}, line {line}: {_width(row)} cells in {width} columns")
 
 
 def number_in(text: str) -> float:
@@ -209,7 +256,8 @@ class _Table:
 
     def __init__(self, name: str, content: bytes) -> None:
         self.name, self.sha256 = name, hashlib.sha256(content).hexdigest()
-        (_, *self.lines), (self.header, *self.rows) = csv_rows(f"file '{name}'", content)
+        self.rows = CsvRows(f"file '{name}'", content)
+        self.header = self.rows[0]
         self.place = {column: i for i, column in enumerate(self.header)}
         if len(self.place) != len(self.header):
             twice = next(name_ for name_ in self.header if self.header.count(name_) > 1)
@@ -229,7 +277,7 @@ class _Table:
         if times is not None:
             return Column(self._times(matches, times), values, origin)
         if len(matches) > 1:
-            first, second, *_ = (self.lines[i] for i in matches)
+            first, second, *_ = (self.rows.lines[i] for i in matches)
             remedy = "fix more columns in 'where', or name the column of times in 'times'"
             raise CirlError(f"{origin}: lines {first} and {second} both match; {remedy}")
         return Column(None, values, origin)
@@ -239,8 +287,7 @@ class _Table:
         keys = tuple(self.place[column_] for column_ in conditions)
         if keys not in self._indices:
             index: dict[tuple[str, ...], list[int]] = {}
-            columns = [map(itemgetter(key), self.rows) for key in keys]
-            for i, texts in enumerate(zip(*columns, strict=True) if keys else itertools.repeat((), len(self.rows))):
+            for i, texts in enumerate(self.rows.columns(keys), 1):
                 if texts in index:
                     index[texts].append(i)
                 else:
@@ -253,7 +300,7 @@ class _Table:
 
     def _mismatch(self, conditions: Mapping[str, str]) -> str:
         """Say which entry of ``conditions`` leaves no row, with the nearest value that would leave one."""
-        rows, before = self.rows, ""
+        rows, before = self.rows[1:], ""
         for key, value in conditions.items():
             options = dict.fromkeys(row[self.place[key]] for row in rows)
             if value not in options:
@@ -263,7 +310,7 @@ class _Table:
         return "has no rows"
 
     def _number(self, i: int, column: str) -> float:
-        line, text = self.lines[i], self.rows[i][self.place[column]]
+        line, text = self.rows.lines[i], self.rows[i][self.place[column]]
         value = number_in(text)
         if not math.isfinite(value):
             remedy = "is no number; write one as in 1234.5" if text.strip() else "is empty; write a number, or 0"
@@ -276,7 +323,7 @@ class _Table:
         line_of: dict[Any, int] = {}
         latest: Any = None
         for i in matches:
-            line, row = self.lines[i], self.rows[i]
+            line, row = self.rows.lines[i], self.rows[i]
             subject = f"file '{self.name}', line {line}, column '{column}'"
             text = row[self.place[column]]
             time: Any = _date(text) if has_dates else self._number(i, column)

@@ -32,6 +32,14 @@ ROUNDS = 6
 """Most programs that are solved to improve the plan of a row."""
 MOST_VARIABLES = 50_000
 """Variables of a program up to which the bound of each row is solved unless it is asked for."""
+MOST = 24
+"""Most rows unless another number is asked for."""
+SETTLED = 1e-3
+"""Part of what all levers bring within which some are taken to do as much: nothing more is solved for them."""
+RISE = 2.0
+"""How many times what it last added, or what all lose without it, a lever may add: no bound is solved for more."""
+CLOSE = 0.01
+"""Gap from which on the plan of some levers is improved."""
 
 
 @positional_record
@@ -70,7 +78,7 @@ class LeverRow:
 
 @positional_record
 class Levers:
-    """The levers of a network, each the one that adds most to those before it."""
+    """The levers of a network, each the one that adds most to those before it; the last may be all that are left."""
 
     network: Annotated[Network, "under its scenario"]
     plan: Annotated[Bound, "of all levers; its ``min_service`` is what is demanded"]
@@ -100,6 +108,7 @@ def levers(
     groups: Mapping[str, Sequence[str]] | None = None,
     min_service: ArrayLike | None = None,
     bounds: bool | None = None,
+    most: int = MOST,
     progress: ProgressReport = lambda activity, share: None,
 ) -> Levers:
     """Tell what each lever brings: alone, added to those that bring more, and left out of all of them.
@@ -107,8 +116,11 @@ def levers(
     A lever is an agent, or a group of agents; in copies the same agent of all regions. What supplies to make up for a
     service is none. All levers are planned together; then those of a row are simulated as they are planned, and as a
     plan of these alone has them if its bound is solved, and the better counts. The others are neutral. The order is
-    greedy: with each lever those before it can do most, by their bound if it is solved. All is at the service demanded:
-    what a service lacks has its price in these choices, and stands in the result.
+    greedy: with each lever those before it can do most, by their bound if it is solved. Bounds are solved where they
+    decide: not of a lever that would have to add more than RISE times what it did when it was last tried and what is
+    lost without it, and not once all that is left to gain is SETTLED of what all levers bring; the rest then follow by
+    what they added last, and the bound of all stands for theirs. All is at the service demanded: what a service lacks
+    has its price in these choices, and stands in the result.
 
     Args:
         network: catalogue name, path of a definition file, or a network.
@@ -118,6 +130,7 @@ def levers(
         min_service: mean level of every service, or of each, shape (services,), in [0, 1]; None: what there is as
             usual.
         bounds: whether the bound of each row is solved; None: if the program has at most MOST_VARIABLES variables.
+        most: rows, at least 2; what would have come later is one lever in the last of them.
         progress: called with what is being done and the share that is done.
 
     Raises:
@@ -126,43 +139,80 @@ def levers(
     """
     variant = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
     by_lever = _agents_by_lever(variant, groups or {})
+    if most < 2:
+        raise CirlError(f"most must be at least 2, got {most}")
     usual = _as_usual(variant)
     demand = np.maximum(usual.episode_levels[0] - ROUNDING, 0.0) if min_service is None else min_service
     agents = {agent for group in by_lever.values() for agent in group}
     progress("plan of all levers", 0.0)
     solution = bound(variant, min_service=demand, agents=[agent for agent in variant.agents if agent in agents])
-    plan = improve_plan(solution, progress=part_of(progress, "plan of all levers", 0.0, 0.4))
+    plan = improve_plan(solution, progress=part_of(progress, "plan of all levers", 0.05, 0.1))
     solves = len(plan.solution) <= MOST_VARIABLES if bounds is None else bounds
-    trials = _Trials(plan, by_lever, solves, float(usual.episode_circularity[0]))
-    order = trials.order(part_of(progress, "order", 0.4, 0.2))
-    together, rows = Trial(simulate_plan(plan), plan.objective), []
+    trials = _Trials(plan, by_lever, solves, usual)
+    trials.leave_out(part_of(progress, "levers left out", 0.15, 0.35))
+    order, together, rows = trials.order(most, part_of(progress, "order", 0.5, 0.3)), trials.together, []
     for place, name in enumerate(order):
-        progress("levers", 0.6 + 0.4 * place / len(order))
-        others = [other for other in order if other != name]
+        progress("levers", 0.8 + 0.2 * place / len(order))
         added = together if place == len(order) - 1 else trials.best(order[: place + 1])
         alone = added if place == 0 else trials.best([name])
-        rows.append(LeverRow(name, tuple(by_lever[name]), alone, added, trials.best(others)))
+        rows.append(LeverRow(name, tuple(by_lever[name]), alone, added, trials.without(name)))
     progress("levers", 1.0)
     return Levers(variant, plan, Trial(usual, None), together, tuple(rows))
 
 
 class _Trials:
-    """Episodes in which some of the levers of a plan are pulled."""
+    """Episodes in which some of the levers of a plan are pulled.
 
-    def __init__(self, plan: Bound, by_lever: Mapping[str, Sequence[str]], solves: bool, usual: float) -> None:
+    Attributes:
+        together: that of all levers.
+    """
+
+    def __init__(self, plan: Bound, by_lever: dict[str, list[str]], solves: bool, usual: Rollout) -> None:
         self._plan, self._by_lever, self._solves = plan, by_lever, solves
         self._entries, self._bounds = Actuators(plan.network, plan.agents, 1).entries, dict[tuple[str, ...], Bound]()
         # a service that all levers have in plenty has no price in their plan, and some of them may still lack it
-        self._prices = np.maximum(prices(plan), PENALTY * abs(usual))
+        self._prices = np.maximum(prices(plan), PENALTY * abs(float(usual.episode_circularity[0])))
+        self.together = Trial(simulate_plan(plan), plan.objective)
+        self._first = self._worth(usual)
+        self._near = SETTLED * abs(self._worth(self.together.run) - self._first)
+        self._without: dict[str, Trial] = {}
 
-    def order(self, progress: Callable[[float], None]) -> list[str]:
-        """Return the levers, each the one with which those before it can do most, or do most as they are planned."""
-        order, rest = list[str](), list(self._by_lever)
+    def leave_out(self, progress: Callable[[float], None]) -> None:
+        """Try what all levers but one do, for each."""
+        for done, name in enumerate(self._by_lever):
+            progress(done / len(self._by_lever))
+            self.without(name)
+
+    def without(self, name: str) -> Trial:
+        """Return what all levers but one do."""
+        if name not in self._without:
+            members = self._by_lever[name]
+            rest = [other for other, agents in self._by_lever.items() if not {*agents} & {*members}]
+            self._without[name] = self.best(rest)
+        return self._without[name]
+
+    def order(self, most: int, progress: Callable[[float], None]) -> list[str]:
+        """Return the levers, each the one with which those before it can do most, or do most as they are planned.
+
+        What would come after ``most`` of them is one lever, which is added to those that are known.
+        """
+        order, value = list[str](), self._first
+        rest = dict.fromkeys(self._by_lever, np.inf)  # what each added when it was last tried
         while rest:
             progress(1 - len(rest) ** 2 / len(self._by_lever) ** 2)
-            best = max(rest, key=lambda name: self._promise(self._part_of_plan([*order, name])))
-            order.append(best)
-            rest.remove(best)
+            if len(order) == most - 1 and len(rest) > 1:
+                name = f"{len(rest)} others"
+                self._by_lever[name] = [agent for lever in rest for agent in self._by_lever[lever]]
+                return [*order, name]
+            if self._solves and order and self._plan.objective - value <= self._near:
+                return order + sorted(rest, key=lambda name: -rest[name])
+            best, most_added = -np.inf, {name: max(rest[name], self._loss(name)) for name in rest}
+            for name in sorted(rest, key=lambda name: -most_added[name]):
+                if not self._solves or RISE * most_added[name] >= best:
+                    rest[name] = self._promise(self._part_of_plan([*order, name])) - value
+                    best = max(best, rest[name])
+            order.append(max(rest, key=lambda name: rest[name]))
+            value += rest.pop(order[-1])
         return order
 
     def best(self, names: Iterable[str]) -> Trial:
@@ -171,10 +221,23 @@ class _Trials:
         run = simulate_plan(part)
         if not self._solves:
             return Trial(run, None)
+        if part.agents not in self._bounds and self._worth(run) >= self._worth(self.together.run) - self._near:
+            return Trial(run, self._plan.objective)
         alone = self._bound(part.agents)
-        if self._lacks(run):
-            alone = improve_plan(alone, rounds=ROUNDS, enough=lambda trial: not self._lacks(trial))
-        return Trial(max(run, simulate_plan(alone), key=self._worth), alone.objective)
+        run, plan = max((run, part), (simulate_plan(alone), alone), key=lambda pair: self._worth(pair[0]))
+
+        def is_good(trial: Rollout) -> bool:
+            return not self._lacks(trial) and bool(gap(alone.objective, trial.episode_circularity[0]) <= CLOSE)
+
+        if not is_good(run):
+            improved = improve_plan(replace(alone, actions=plan.actions), rounds=ROUNDS, enough=is_good)
+            run = max(run, simulate_plan(improved), key=self._worth)
+        return Trial(run, alone.objective)
+
+    def _loss(self, name: str) -> float:
+        """Return what all levers lose without one, by their bounds."""
+        bound_without = self.without(name).bound
+        return 0.0 if bound_without is None else self._plan.objective - bound_without
 
     def _promise(self, part: Bound) -> float:
         return self._bound(part.agents).objective if self._solves else self._worth(simulate_plan(part))

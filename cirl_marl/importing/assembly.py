@@ -218,14 +218,13 @@ def _largest_error(path: Path, table: FlowTable, definition: ImportedFiles, prog
     """
     worst = 0.0
     ids = identifiers(table.regions) if table.regions != ("",) else {"": ""}
+    flows = table.grid(table.values)
     for done, (region, id_) in enumerate(ids.items()):
         network = load_network(f"{path}:{id_}" if id_ else path)
         env = MultiAgentVectorEnv(network, num_envs=1)
         origin = episode_start(env)
         run = rollout(env, Neutral(), seed=origin.seed, start=origin.initial_state)
-        table_flows = np.array(
-            [[table.flows.get((region, year, pair), 0.0) for pair in definition.arcs] for year in table.years]
-        )
+        table_flows = flows[done]
         order = [network.arc_index[arc] for arc in definition.arcs.values()]
         errors = np.abs(run.flow[:, order] - table_flows)
         if errors.max() > WRONG * table_flows.max():

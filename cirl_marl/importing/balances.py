@@ -102,13 +102,9 @@ class Processes:
         self._table = table
         self.names = tuple(dict.fromkeys(end for pair in table.pairs for end in (pair.source, pair.target)))
         self._place = {name: i for i, name in enumerate(self.names)}
-        regions, years, pairs = table.regions, table.years, table.pairs
-        self.flows = np.zeros((len(regions), len(years), len(pairs)))
-        at = [{key: i for i, key in enumerate(keys)} for keys in (regions, years, pairs)]
-        for (region, year, pair), value in table.flows.items():
-            self.flows[at[0][region], at[1][year], at[2][pair]] = value
-        self._incidence = np.zeros((len(self.names), len(pairs)))
-        for k, pair in enumerate(pairs):
+        self.flows = table.grid(table.values)
+        self._incidence = np.zeros((len(self.names), len(table.pairs)))
+        for k, pair in enumerate(table.pairs):
             self._incidence[self._place[pair.source], k] -= 1.0
             self._incidence[self._place[pair.target], k] += 1.0
         inflow, outflow = self._sums(1.0), self._sums(-1.0)
@@ -156,18 +152,16 @@ class Processes:
         stores nothing, m the flows of the table and σ their standard deviations, or 10 % of flows that state none
         (Cencic and Rechberger 2008). A flow of 0 stays 0.
         """
-        table, flows = self._table, dict(self._table.flows)
+        table, flows = self._table, self.flows.copy()
+        stated_deviations = table.grid(table.deviations, np.nan)
         rows = np.array([kind is ProcessKind.TRANSIT for kind in self.kinds.values()])
         balances, changes = self._incidence[rows], []
         chi_square, degrees = 0.0, 0
         for r, region in enumerate(table.regions):
             for y, year in enumerate(table.years):
                 table_flow = self.flows[r, y]
-                given_deviations = [table.deviations.get((region, year, pair)) for pair in table.pairs]
-                stated_deviations = np.array(
-                    [np.nan if deviation is None else deviation for deviation in given_deviations]
-                )
-                deviations = np.where(np.isnan(stated_deviations), UNCERTAIN * table_flow, stated_deviations)
+                stated = stated_deviations[r, y]
+                deviations = np.where(np.isnan(stated), UNCERTAIN * table_flow, stated)
                 closest = _closest(table_flow, np.where(table_flow > 0, deviations, 0.0), balances)
                 if closest is None:
                     place = f"{region}, {year}" if region else str(year)
@@ -177,10 +171,9 @@ class Processes:
                 chi_square += float((((closest - table_flow)[free] / deviations[free]) ** 2).sum())
                 degrees += int(np.linalg.matrix_rank(balances[:, free])) if free.any() else 0
                 for k in np.flatnonzero(np.abs(closest - table_flow) > 1e-9 * table_flow.max()).tolist():
-                    pair = table.pairs[k]
-                    flows[region, year, pair] = float(closest[k])
-                    changes.append(Change(region, year, pair, table_flow[k], float(closest[k]), float(deviations[k])))
-        return replace(table, flows=flows), Reconciliation(tuple(changes), chi_square, degrees)
+                    flows[r, y, k] = after = float(closest[k])
+                    changes.append(Change(region, year, table.pairs[k], table_flow[k], after, float(deviations[k])))
+        return replace(table, values=flows[table.cells]), Reconciliation(tuple(changes), chi_square, degrees)
 
     def stock_mistakes(self, stocks: Mapping[tuple[str, str, int], float]) -> dict[str, float]:
         """Return, for each process with stocks, the largest difference between their growth and what the flows say.

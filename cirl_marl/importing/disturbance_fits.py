@@ -42,6 +42,7 @@ class DisturbanceFits:
 
     disturbances: Annotated[Mapping[str, Disturbance], "by name"]
     errors: Annotated[Mapping[str, Errors], "standard errors of their numbers, by name and field"]
+    intervals: Annotated[Mapping[str, tuple[float, float]], "95 % intervals of deviations, by name; none of chains"]
     trends: Annotated[Mapping[str, tuple[float, float]], "change a row, relative or in the unit, with its error"]
     correlation: Annotated[Correlation | None, "of what drives them, if there are several"]
     correlation_errors: Annotated[Floats, "standard errors of its entries; no rows without it"]
@@ -54,6 +55,9 @@ class DisturbanceFits:
         prefix, tables = f"scenarios.{scenario}." if scenario else "", []
         for name, disturbance in self.disturbances.items():
             errors = ", ".join(f"{field} ± {_error_text(error)}" for field, error in self.errors[name].items())
+            if name in self.intervals:
+                low, high = self.intervals[name]
+                errors += f"; 95 % of deviation: {low:.2g} to {high:.2g}"
             source = f"{self.source}; {self.rows}; {errors}"
             entries = {"kind": disturbance.kind, **self._entries(disturbance), "unit": disturbance.unit}
             tables.append(_table(f"{prefix}disturbances.{name}", {**entries, "source": source}))
@@ -148,6 +152,7 @@ def fit_disturbances(
     return DisturbanceFits(
         disturbances={name: part.disturbance for name, part in estimates.items()},
         errors={name: part.errors for name, part in estimates.items()},
+        intervals={name: part.interval for name, part in estimates.items() if part.interval is not None},
         trends={name: noise.trend for name, noise in noises.items()},
         correlation=correlation,
         correlation_errors=uncertainty,

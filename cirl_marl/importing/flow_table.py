@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from operator import itemgetter
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
+import numpy as np
+
 from cirl_marl.definitions.data_files import no_collection, number_in
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.importing.grids import Grid, GridPart, Memo, is_year, read_grids
+from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.units import factor
 
@@ -31,34 +33,39 @@ class Connection(NamedTuple):
         return f"'{self.source}' to '{self.target}'" + (f", {self.type}" if self.type else "")
 
 
-Key = tuple[str, int, Connection]
-"""Region, empty where there are none, year, and what the flow is."""
-
-
 @positional_record
 class FlowTable:
-    """Flows by region, year and pair; what is not in ``flows`` is 0."""
+    """Flows by region, year and pair; what is not in the table is 0."""
 
     name: Annotated[str, "the file"]
     unit: Annotated[str, "mass/time"]
-    flows: Annotated[Mapping[Key, float], "by region (empty without regions), year and pair"]
-    deviations: Annotated[Mapping[Key, float], "standard deviations, of those that state one"]
-
-    @property
-    def regions(self) -> tuple[str, ...]:
-        """Regions, in the order of the file."""
-        return tuple(dict.fromkeys(region for region, _, _ in self.flows))
+    regions: Annotated[tuple[str, ...], "in the order of the file; one empty text if there are none"]
+    pairs: Annotated[tuple[Connection, ...], "in the order of the file"]
+    places: Annotated[Integers, "region and pair, counted, with the year between them, shape (3, flows)"]
+    values: Annotated[Floats, "the flows, shape (flows,), mass/time"]
+    deviations: Annotated[Floats, "standard deviations, NaN where none is stated, shape (flows,), mass/time"]
 
     @property
     def years(self) -> tuple[int, ...]:
         """First to last year."""
-        years = [year for _, year, _ in self.flows]
-        return tuple(range(min(years), max(years) + 1))
+        return tuple(range(int(self.places[1].min()), int(self.places[1].max()) + 1))
 
     @property
-    def pairs(self) -> tuple[Connection, ...]:
-        """Pairs, in the order of the file."""
-        return tuple(dict.fromkeys(pair for _, _, pair in self.flows))
+    def flows(self) -> dict[tuple[str, int, Connection], float]:
+        """The flows by region, year and pair."""
+        cells = zip(*self.places.tolist(), self.values.tolist(), strict=True)
+        return {(self.regions[region], year, self.pairs[pair]): value for region, year, pair, value in cells}
+
+    def grid(self, values: Floats, fallback: float = 0.0) -> Floats:
+        """Return ``values`` of flows with ``fallback`` for what is not in the table, shape (regions, years, pairs)."""
+        grid = np.full((len(self.regions), len(self.years), len(self.pairs)), fallback)
+        grid[self.cells] = values
+        return grid
+
+    @property
+    def cells(self) -> tuple[Integers, ...]:
+        """Where flows are in a grid."""
+        return self.places[0], self.places[1] - self.places[1].min(), self.places[2]
 
     def of(self, regions: Sequence[str]) -> FlowTable:
         """Return the part of some regions.
@@ -67,10 +74,28 @@ class FlowTable:
             CirlError: for one that is not there; names the nearest.
         """
         for region in regions:
-            if region not in (present := self.regions):
-                raise CirlError(f"{self.name}: {unknown_name('region', region, present)}")
-        selection = {key: value for key, value in self.flows.items() if key[0] in regions}
-        return replace(self, flows=selection)
+            if region not in self.regions:
+                raise CirlError(f"{self.name}: {unknown_name('region', region, self.regions)}")
+        kept = np.isin(self.places[0], [i for i, region in enumerate(self.regions) if region in regions])
+        places = self.places[:, kept]
+        orders = [_order_of_appearance(numbers) for numbers in (places[0], places[2])]
+        places[0], places[2] = (places_ for _, places_ in orders)
+        names = [self.regions[i] for i in orders[0][0]], [self.pairs[i] for i in orders[1][0]]
+        return replace(
+            self,
+            regions=tuple(names[0]),
+            pairs=tuple(names[1]),
+            places=places,
+            values=self.values[kept],
+            deviations=self.deviations[kept],
+        )
+
+
+def _order_of_appearance(numbers: Integers) -> tuple[Integers, Integers]:
+    """Return the different ``numbers`` in the order in which they come, and the place of each in that."""
+    different, first, place = np.unique(numbers, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    return different[order], np.argsort(order)[place]
 
 
 def read_flows(path: Path, *, sheet: str | None = None, unit: str | None = None, year: int | None = None) -> FlowTable:
@@ -95,39 +120,47 @@ def read_flows(path: Path, *, sheet: str | None = None, unit: str | None = None,
 
 
 def _read_flows(path: Path, sheet: str | None, default_unit: str | None, default_year: int | None) -> FlowTable:
-    flows: dict[Key, float] = {}
-    keys: list[Key] = []
-    places: list[tuple[str, Sequence[int]]] = []
-    deviations: dict[Key, float] = {}
+    regions: dict[str, int] = {}
+    pairs: dict[Connection, int] = {}
+    parts: list[_Entries] = []
     units: dict[str, str] = {}
-    present: dict[tuple[str, int], None] = {}
     for grid in read_grids(path, sheet):
         long = {"source", "target"} <= grid.places.keys()
-        for entries in _long(grid, default_year) if long else _matrix(grid, default_year):
-            flows.update(zip(entries.keys, entries.values, strict=True))
-            keys += entries.keys
-            present |= dict.fromkeys(map(itemgetter(0, 1), entries.keys))
-            places.append((grid.name, entries.lines))
-            deviations |= entries.deviations
+        for entries in (_long if long else _matrix)(grid, default_year, regions, pairs):
+            parts.append(entries)
             for unit_of_row, line in entries.units.items():
                 units.setdefault(unit_of_row, f"{grid.name}, line {line}")
-            if len(flows) < len(keys):
-                raise CirlError(_repetition(keys, places))
-    if not flows:
+    if not pairs:
         raise CirlError(f"{path}: has no flows")
-    _check_years(path.name, present)
-    return FlowTable(path.name, _unit(path, units, default_unit), flows, deviations)
+    table = FlowTable(
+        path.name,
+        "",
+        tuple(regions),
+        tuple(pairs),
+        np.concatenate([part.places for part in parts], axis=1),
+        np.concatenate([part.values for part in parts]),
+        np.concatenate([part.deviations for part in parts]),
+    )
+    _check_repetitions(table, parts)
+    _check_years(table)
+    return replace(table, unit=_unit(path, units, default_unit))
 
 
-def _repetition(keys: Sequence[Key], places: Sequence[tuple[str, Sequence[int]]]) -> str:
-    """Say which flow stands in a table twice."""
-    line_of: dict[Key, int] = {}
-    positions = ((name, line) for name, lines in places for line in lines)
-    for (region, year, pair), (name, line) in zip(keys, positions, strict=True):
-        if (earlier := line_of.setdefault((region, year, pair), line)) != line:
-            flow = f"{pair} in {year}{f' in {region}' if region else ''}"
-            return f"{name}, line {line}: {flow} stands in line {earlier} too; leave one out, or give them types"
-    raise AssertionError("no flow stands there twice")
+def _check_repetitions(table: FlowTable, parts: Sequence[_Entries]) -> None:
+    """Refuse a flow that stands in a table twice; a ``CirlError`` names the first."""
+    region, year, pair = table.places
+    numbers = (region * (LAST_YEAR + 1) + year) * len(table.pairs) + pair
+    ordered = np.sort(numbers)
+    if (ordered[1:] > ordered[:-1]).all():
+        return
+    order = np.argsort(numbers, kind="stable")
+    later = int(order[1:][numbers[order[1:]] == numbers[order[:-1]]].min())
+    earlier = int(np.flatnonzero(numbers == numbers[later])[0])
+    positions = [(part.name, line) for part in parts for line in part.lines]
+    (name, line), first = positions[later], positions[earlier][1]
+    place = table.regions[region[later]]
+    flow = f"{table.pairs[pair[later]]} in {year[later]}{f' in {place}' if place else ''}"
+    raise CirlError(f"{name}, line {line}: {flow} stands in line {first} too; leave one out, or give them types")
 
 
 def read_stocks(path: Path, unit: str) -> dict[tuple[str, str, int], float]:
@@ -144,10 +177,8 @@ def read_stocks(path: Path, unit: str) -> dict[tuple[str, str, int], float]:
         factors = Memo[str, float](lambda text: factor(text.strip(), unit))
         for part in grid.parts():
             years = part.convert(part.of("year"), Memo(_year))
-            values, scales = (
-                part.numbers(grid.places["value"], part.of("value")),
-                part.convert(part.of("unit"), factors),
-            )
+            values = part.numbers(grid.places["value"], part.of("value")).tolist()
+            scales = part.convert(part.of("unit"), factors)
             cells = zip(part.of("region"), part.of("process"), years, part.lines, values, scales, strict=True)
             for region, process, year, line, value, scale in cells:
                 key = region.strip(), process.strip(), year
@@ -157,19 +188,22 @@ def read_stocks(path: Path, unit: str) -> dict[tuple[str, str, int], float]:
     return stocks
 
 
-@dataclass(frozen=True, slots=True)
+@positional_record
 class _Entries:
-    """Flows of some rows: their lines, keys and values, the first line of each unit, and deviations that are stated."""
+    """Flows of some rows."""
 
-    lines: Sequence[int]
-    keys: list[Key]
-    values: list[float]
-    units: Mapping[str, int]
-    deviations: Mapping[Key, float]
+    name: Annotated[str, "of the grid"]
+    lines: Annotated[Sequence[int], "of each flow"]
+    places: Annotated[Integers, "region and pair, counted, with the year between them, shape (3, flows)"]
+    values: Annotated[Floats, "shape (flows,)"]
+    deviations: Annotated[Floats, "NaN where none is stated, shape (flows,)"]
+    units: Annotated[Mapping[str, int], "the first line of each"]
 
 
-def _long(grid: Grid, default_year: int | None) -> Iterator[_Entries]:
-    """Yield the flows of a long table."""
+def _long(
+    grid: Grid, default_year: int | None, regions: dict[str, int], pairs: dict[Connection, int]
+) -> Iterator[_Entries]:
+    """Yield the flows of a long table, and count the regions and pairs that are new."""
     unit = ""
     if "value" not in grid.places:
         used_columns = set(grid.places.values())
@@ -183,17 +217,20 @@ def _long(grid: Grid, default_year: int | None) -> Iterator[_Entries]:
     if default_year is None:
         grid.require(("year",))
     ends = itemgetter(*(grid.places[key] for key in ("source", "target", "type") if key in grid.places))
-    pairs, years, regions = Memo(_connection), Memo(_year), Memo[str, str](str.strip)
+    pair_numbers = Memo[tuple[str, ...], int](lambda cells: pairs.setdefault(_connection(cells), len(pairs)))
+    region_numbers = Memo[str, int](lambda text: regions.setdefault(text.strip(), len(regions)))
+    years = Memo(_year)
     for part in grid.parts():
-        year_of_row: Iterable[int] = itertools.repeat(default_year or 0, len(part.rows))
+        year_of_row = [default_year or 0] * len(part.rows)
         if "year" in grid.places:
             year_of_row = part.convert(part.of("year"), years)
-        region_of_row = part.convert(part.of("region"), regions)
-        keys = list(zip(region_of_row, year_of_row, part.convert(list(map(ends, part.rows)), pairs), strict=True))
+        region_of_row = part.convert(part.of("region"), region_numbers)
+        pair_of_row = part.convert(list(map(ends, part.rows)), pair_numbers)
         values = part.numbers(grid.places["value"], part.of("value"))
         texts = part.of("unit")
         units = {unit or text.strip(): part.lines[texts.index(text)] for text in dict.fromkeys(texts)}
-        yield _Entries(part.lines, keys, values, units, dict(_deviations(part, keys, values)))
+        places = np.array([region_of_row, year_of_row, pair_of_row], dtype=np.intp)
+        yield _Entries(grid.name, part.lines, places, values, _deviations(part, values), units)
 
 
 def _connection(cells: tuple[str, ...]) -> Connection:
@@ -214,20 +251,23 @@ def _year(text: str) -> int:
     return int(value)
 
 
-def _deviations(part: GridPart, keys: Sequence[Key], values: Sequence[float]) -> Iterator[tuple[Key, float]]:
-    """Yield the standard deviations that rows state, by their keys."""
-    column = part.grid.places.get("uncertainty")
-    if column is not None:
-        texts = [row[column].strip() for row in part.rows]
-        stated = [i for i, text in enumerate(texts) if text]
-        rows = GridPart(part.grid, [part.lines[i] for i in stated], [part.rows[i] for i in stated])
-        deviations = rows.numbers(column, [texts[i].rstrip("% ") for i in stated])
-        for i, deviation in zip(stated, deviations, strict=True):
-            yield keys[i], deviation * (values[i] / 100 if texts[i].endswith("%") else 1.0)
+def _deviations(part: GridPart, values: Floats) -> Floats:
+    """Return the standard deviations that rows state, NaN where they state none, shape (rows,)."""
+    deviations, column = np.full(len(values), np.nan), part.grid.places.get("uncertainty")
+    if column is None:
+        return deviations
+    texts = [row[column].strip() for row in part.rows]
+    stated = [i for i, text in enumerate(texts) if text]
+    rows = GridPart(part.grid, [part.lines[i] for i in stated], [part.rows[i] for i in stated])
+    scale = np.array([values[i] / 100 if texts[i].endswith("%") else 1.0 for i in stated])
+    deviations[stated] = rows.numbers(column, [texts[i].rstrip("% ") for i in stated]) * scale
+    return deviations
 
 
-def _matrix(grid: Grid, default_year: int | None) -> Iterator[_Entries]:
-    """Yield the flows of a matrix of processes, which state no unit and no deviation."""
+def _matrix(
+    grid: Grid, default_year: int | None, regions: dict[str, int], pairs: dict[Connection, int]
+) -> Iterator[_Entries]:
+    """Yield the flows of a matrix of processes, which state no unit and no deviation, and count pairs that are new."""
     sheet_name = grid.name.rpartition(", sheet '")[2].rstrip("'")
     year = int(sheet_name) if is_year(sheet_name) else default_year
     if year is None:
@@ -240,19 +280,18 @@ def _matrix(grid: Grid, default_year: int | None) -> Iterator[_Entries]:
         if not target or count > 1:
             problem = f"names '{target}' twice" if target else "has a column without a name"
             raise CirlError(f"{grid.name}, line 1: {problem}; each column is a process that receives")
-    pairs = Memo(_connection)
+    region = regions.setdefault("", len(regions))
+    pair_numbers = Memo[tuple[str, ...], int](lambda cells: pairs.setdefault(_connection(cells), len(pairs)))
     for part in grid.parts():
         columns = [[row[k].strip() or "0" for row in part.rows] for k in range(1, len(grid.header))]
-        numbers = [part.numbers(k, texts) for k, texts in enumerate(columns, 1)]
-        lines, ends, values = [], [], []
-        for line, row, row_values in zip(part.lines, part.rows, zip(*numbers, strict=True), strict=True):
-            for target, value in zip(targets, row_values, strict=True):
-                if value > 0:
-                    lines.append(line)
-                    ends.append((row[0], target))
-                    values.append(value)
-        keys = [("", year, pair) for pair in GridPart(grid, lines, part.rows).convert(ends, pairs)]
-        yield _Entries(lines, keys, values, {"": lines[0]} if lines else {}, {})
+        numbers = np.array([part.numbers(k, texts) for k, texts in enumerate(columns, 1)]).reshape(len(columns), -1)
+        rows, receivers = (places.tolist() for places in np.nonzero(numbers.T))
+        lines = [part.lines[i] for i in rows]
+        ends = [(part.rows[i][0], targets[k]) for i, k in zip(rows, receivers, strict=True)]
+        pair_of_flow = GridPart(grid, lines, part.rows).convert(ends, pair_numbers)
+        places = np.array([[region] * len(ends), [year] * len(ends), pair_of_flow], dtype=np.intp)
+        values, unstated = numbers[receivers, rows], np.full(len(ends), np.nan)
+        yield _Entries(grid.name, lines, places, values, unstated, {"": lines[0]} if lines else {})
 
 
 def _unit(path: Path, units: Mapping[str, str], default_unit: str | None) -> str:
@@ -282,13 +321,14 @@ def _factor(place: str, unit: str, target: str) -> float:
         raise CirlError(f"{place}: {error}") from error
 
 
-def _check_years(name: str, present: Mapping[tuple[str, int], None]) -> None:
+def _check_years(table: FlowTable) -> None:
     """Refuse a region without any flow in a year between the first and the last."""
-    years = [year for _, year in present]
-    for region in dict.fromkeys(region for region, _ in present):
-        gaps = [year for year in range(min(years), max(years) + 1) if (region, year) not in present]
+    present = np.zeros((len(table.regions), len(table.years)), dtype=bool)
+    present[table.cells[:2]] = True
+    for region, has_flows in zip(table.regions, present, strict=True):
+        gaps = [year for year, is_present in zip(table.years, has_flows, strict=True) if not is_present]
         if gaps:
             owner = f"region '{region}'" if region else "the table"
             listing = ", ".join(map(str, gaps[:5])) + (", …" if len(gaps) > 5 else "")
             remedy = "a flow that is not in the table is 0, but a year without any is missing. Add it, or leave it out"
-            raise CirlError(f"{name}: {owner} has no flow in {listing}: {remedy} everywhere")
+            raise CirlError(f"{table.name}: {owner} has no flow in {listing}: {remedy} everywhere")

@@ -15,6 +15,7 @@ import numpy as np
 from cirl_marl.definitions.data_files import Block, check_lengths, csv_blocks, number_in
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.importing.workbooks import read_sheets
+from cirl_marl.network import Floats
 from cirl_marl.records.files import read_content
 
 K = TypeVar("K")
@@ -56,13 +57,13 @@ class GridPart:
             line = next(line for line, text in zip(self.lines, texts, strict=True) if text not in values)
             raise CirlError(f"{self.grid.name}, line {line}: {error}") from error
 
-    def numbers(self, column: int, texts: Sequence[str]) -> list[float]:
-        """Return the numbers of a column; a ``CirlError`` names file, line and column of what is negative or none."""
+    def numbers(self, column: int, texts: Sequence[str]) -> Floats:
+        """Return the numbers of a column, shape (rows,); a ``CirlError`` names a negative one, or what is none."""
         try:
             values = list(map(float if "_" not in "".join(texts) else number_in, texts))
         except ValueError:
             values = list(map(number_in, texts))
-        array = np.array(values)
+        array = np.array(values, dtype=float)
         if not ((array >= 0.0) & (array < math.inf)).all():
             i = next(i for i, value in enumerate(values) if not 0.0 <= value < math.inf)
             fault = "is no number; write one as in 1234.5, or leave out the row"
@@ -71,7 +72,7 @@ class GridPart:
             text = texts[i] if math.isfinite(values[i]) else f"'{texts[i]}'"
             place = f"{self.grid.name}, line {self.lines[i]}, column '{self.grid.header[column]}'"
             raise CirlError(f"{place}: {text} {fault}")
-        return values
+        return array
 
 
 class Memo(dict[K, V]):

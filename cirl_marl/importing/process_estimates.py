@@ -58,6 +58,8 @@ class Estimate(NamedTuple):
 
     disturbance: Disturbance
     errors: Errors
+    interval: tuple[float, float] | None = None
+    """95 % interval of the deviation, if there is one, which is wider above in short series."""
 
 
 def series_noise(column: Column, options: FitOptions) -> Noise:
@@ -128,14 +130,22 @@ def _positive(process: Any, options: FitOptions) -> Any:
 
 def _ar1(noise: Noise, options: FitOptions, rows: float, _: float) -> Estimate:
     fields, errors = _gaussian(noise, options, rows)
-    return Estimate(_positive(AutoRegression(mean=0.0 if options.unit else 1.0, **fields), options), errors)
+    return Estimate(
+        _positive(AutoRegression(mean=0.0 if options.unit else 1.0, **fields), options),
+        errors,
+        noise.estimate.deviation_interval,
+    )
 
 
 def _seasonal(noise: Noise, options: FitOptions, rows: float, spacing: float) -> Estimate:
     fields, errors = _gaussian(noise, options, rows)
     profile = tuple(map(in_digits, noise.seasons.tolist()))
     process = Seasonal(profile=profile, period=options.seasons * spacing, **fields)
-    return Estimate(_positive(process, options), {**errors, "profile": tuple(noise.season_errors.tolist())})
+    return Estimate(
+        _positive(process, options),
+        {**errors, "profile": tuple(noise.season_errors.tolist())},
+        noise.estimate.deviation_interval,
+    )
 
 
 def _record(noise: Noise, options: FitOptions, rows: float, _: float) -> Estimate:
@@ -154,7 +164,7 @@ def _record(noise: Noise, options: FitOptions, rows: float, _: float) -> Estimat
         values=tuple(map(in_digits, record.tolist())), block=in_digits(block), unit=options.unit or "1"
     )
     errors = {"block": slope * noise.estimate.persistence_error}
-    return Estimate(process, errors | {"deviation": noise.estimate.deviation_error})
+    return Estimate(process, errors | {"deviation": noise.estimate.deviation_error}, noise.estimate.deviation_interval)
 
 
 NOISE_KINDS: Mapping[str, Callable[[Noise, FitOptions, float, float], Estimate]] = {

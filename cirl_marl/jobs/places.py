@@ -171,7 +171,8 @@ def _address() -> str:
 
 
 def _ray() -> Any:
-    """Import Ray, or say that it is missing."""
+    """Import Ray, or say that it is missing; the logs of a node that dies are left out of what it prints."""
+    os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", "Raylet is terminated")  # read when it is imported
     try:
         return import_module("ray")
     except ModuleNotFoundError as error:

@@ -270,7 +270,8 @@ def draw_network(network: Any, factors: Sequence[float] = (), path: Floats | Non
         course = path[: len(stated), network.processes.names.index(disturbed.by)]
         value = stated * drawn.get(number, 1.0)
         course = value + disturbed.scale * course if disturbed.adds else value * course
-        change(part, name, in_intervals(course, interval))
+        # what stands still throughout is no number that somebody forgot
+        change(part, name, in_intervals(course, interval) or Series(times=(0.0,), values=(0.0,)))
     for split in splits(network):
         arcs, controlled = ([network.arcs[k] for k in part] for part in (split.other_arcs, split.controlled_arcs))
         shares_ = [changes.get(id(arc), (arc, {}))[1].get("share", arc.share) for arc in arcs]

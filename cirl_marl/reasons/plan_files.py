@@ -11,7 +11,7 @@ import numpy as np
 from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import episode_start, first_seed, rollout
 from cirl_marl.controllers.schedule import control_names
-from cirl_marl.definitions.data_files import csv_rows, number_in
+from cirl_marl.definitions.data_files import CsvRows, number_in
 from cirl_marl.dynamics.stages import simulated_network
 from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.environments.actuators import Actuators
@@ -94,7 +94,8 @@ class _Table:
             content = read_content(path)
         except OSError as error:
             raise CirlError(f"{path}: cannot be read: {error}") from error
-        (_, *self.lines), (self.header, *self.rows) = csv_rows(str(path), content)
+        rows = CsvRows(str(path), content)
+        self.lines, (self.header, *self.rows) = rows.lines[1:], rows
 
     def check_steps(self, network: Network, intervals: int) -> None:
         """Check how many intervals it has, which are those of an episode."""

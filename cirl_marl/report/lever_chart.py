@@ -18,8 +18,6 @@ from cirl_marl.report.terminal import text_table
 
 LEVER_FILES = ("levers.csv", "levers.json", "levers.png")
 CASES = ("alone", "with those above", "without it")
-SHOWN = 24
-"""Most levers in the chart; the others stand in one bar."""
 
 
 def levers_table(levers: Levers) -> Table:
@@ -70,14 +68,11 @@ def save_levers(path: str | Path, levers: Levers, *, title: str = "") -> Path:
     """Save a chart as a PNG and return its path.
 
     Left, each lever takes λ̄ on from where those above it left it; right, what it brings alone and what is lost without
-    it. Of many levers the last ones stand in one row.
+    it.
     """
-    network, count = levers.network, min(len(levers.rows), SHOWN)
-    changes = np.array([levers.changes(place) for place in range(len(levers.rows))])
-    added = np.append(changes[: count - 1, 1], changes[count - 1 :, 1].sum())
-    names = [row.name for row in levers.rows[:count]]
-    if count < len(levers.rows):
-        names[-1] = f"{len(levers.rows) - count + 1} others"
+    network, count = levers.network, len(levers.rows)
+    changes = np.array([levers.changes(place) for place in range(count)])
+    added, names = changes[:, 1], [row.name for row in levers.rows]
     usual, whole = levers.usual.circularity, levers.together.circularity
     ends, places = usual + np.cumsum(added), np.arange(1, count + 1)
     figure = Figure(figsize=(WIDTH, 1.7 + 0.34 * (count + 2)), layout="constrained")
@@ -99,11 +94,10 @@ def save_levers(path: str | Path, levers: Levers, *, title: str = "") -> Path:
     left.set_yticks([0, *places, count + 1], ["as usual", *names, "all levers"])
     left.invert_yaxis()
     left.set_xlim(min(usual, *ends) - 0.04 * span, max(levers.plan.objective, *ends, usual) + 0.22 * span)
-    shown = changes[:count]
-    right.hlines(places, shown[:, [0, 2]].min(axis=1), shown[:, [0, 2]].max(axis=1), color=NEUTRAL, linewidth=1.5)
-    right.plot(shown[:, 0], places, "o", color=SERIES[2], markersize=6, label="it alone")
+    right.hlines(places, changes[:, [0, 2]].min(axis=1), changes[:, [0, 2]].max(axis=1), color=NEUTRAL, linewidth=1.5)
+    right.plot(changes[:, 0], places, "o", color=SERIES[2], markersize=6, label="it alone")
     hollow = {"markerfacecolor": "white", "color": SERIES[1]}
-    right.plot(shown[:, 2], places, "o", markersize=6, label="lost without it", **hollow)
+    right.plot(changes[:, 2], places, "o", markersize=6, label="lost without it", **hollow)
     right.axvline(0.0, color=NEUTRAL, linewidth=1)
     mass = network.mass_unit
     style_axes(left, title="added to those above, and the share of all so far", size=8.5)

@@ -133,6 +133,7 @@ def disturbances_table(network: Network) -> Table:
     for name, part in zip(network.processes.names, network.processes.disturbances, strict=True):
         low, high = part.ends
         seen = f"{part.delayed} late" if part.delayed else f"{part.forecast} ahead" if part.forecast else part.observed
+        seen += f", by {', '.join(part.observed_by)}" if part.observed_by else ""
         places = [path for path, effect in network.disturbed.items() if effect.by == name]
         values = f"{low:.4g} … {high:.4g} {'' if part.unit == '1' else part.unit}"
         rows.append([name, part.kind, values, seen, "\n".join(places)])
