@@ -38,10 +38,10 @@ from cirl_marl.evaluation import compare
 from cirl_marl.network.disturbances import BlockBootstrap, DisturbanceEffect, Gaussian, Markov
 from cirl_marl.network.innovations import innovations
 from cirl_marl.network.uncertainty import Spread, draw_network, expected_network
-from cirl_marl.optimum import NoCertificate, draws, uncertain_bound
+from cirl_marl.optimum import NoCertificate, draws, price_fit, uncertain_bound
 from cirl_marl.optimum.draws import Draw, DrawProgram, DrawProof, Prices
 from cirl_marl.optimum.mpc import MPC
-from cirl_marl.optimum.price_fit import KNOTS, Sample, fit_prices
+from cirl_marl.optimum.price_fit import KNOTS, PriceTrial, Sample, fit_prices, improve
 from cirl_marl.optimum.solver import SolverFailure, solve
 from cirl_marl.optimum.uncertain_bound import Sampling
 
@@ -209,6 +209,40 @@ def test_the_bound_is_that_of_all_paths_at_once(horizon: int, chain: Markov) -> 
     assert paths.mean(fitted) >= best - 1e-8
     if chain is CHAIN:
         assert paths.mean(fitted) <= informed - 0.3 * (informed - best)
+
+
+@pytest.mark.medium
+def test_fitted_prices_close_what_foresight_is_worth() -> None:
+    """A store is worth the same to who knows the demand to come, whatever it was: prices grow from nothing there."""
+    network, demand = stockist(5), 0.95
+    paths = Paths.of(network)
+    best = paths.best(demand)[0]
+    drawn = np.random.default_rng(1).choice(len(paths.chance), 64, p=paths.chance)
+    informed, fitted = (
+        paths.mean(prices)
+        for prices in fit_prices([paths.programs[i] for i in drawn], np.array([demand]), 1.0)
+    )
+    assert informed - best > 0.05 * abs(best)
+    assert best - 1e-8 <= fitted <= informed - 0.5 * (informed - best)
+
+
+def test_improvement_never_rises(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every step of the fit lowers the mean of its draws, and the last is below perfect information and regression."""
+    network = stockist(4)
+    paths = Paths.of(network)
+    steps: list[list[float]] = []
+
+    def recorded(*arguments: Any) -> list[PriceTrial]:
+        trials = improve(*arguments)
+        steps.append([float(trial.values.mean()) for trial in trials])
+        return trials
+
+    monkeypatch.setattr(price_fit, "improve", recorded)
+    price_fit.fit_prices(paths.programs, np.array([0.95]), 1.0)
+    for values in steps:
+        assert len(values) > 1
+        assert (np.diff(values) < 0).all()
+    assert steps[1][-1] < steps[0][-1] - 1e-3
 
 
 @pytest.mark.medium

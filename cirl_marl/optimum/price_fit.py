@@ -1,9 +1,9 @@
 """Prices that leave a clairvoyant little use of foresight, fitted to draws of their own.
 
-What stocks are worth in the optima of some draws is regressed on the states of the disturbances, again and again under
-the prices found so far. How much of each price is charged, and the prices on services, are then improved by cutting
-planes in a box: what is proved on average is convex in them, and every optimum gives a subgradient. Draws kept apart
-choose among all that was tried. Whatever prices come out, what they prove of other draws is a bound.
+What stocks are worth in the optima of some draws is regressed on what is new about the disturbances. From there, and
+from no prices at all, prices on stocks and on services are improved together by cutting planes in a box: what is proved
+on average is convex in them, and the optimum of every draw gives a subgradient. Draws kept apart choose among what was
+tried. Whatever prices come out, what they prove of other draws is a bound.
 
 References: Brown and Smith 2014, Information relaxations, duality, and convex stochastic dynamic programs (gradients as
 penalties); Marsten, Hogan and Blankenship 1975, The boxstep method for large-scale optimization.
@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import optimize, sparse
 
 from cirl_marl.errors import CirlError
@@ -26,20 +27,19 @@ from cirl_marl.optimum.solver import Basis
 
 KNOTS = 3
 """Times between which prices are linear."""
-REGRESSIONS = 2
-CUTS = 10
-"""Rounds of cutting planes, each of which solves every draw."""
+CUTS = 30
+"""Most rounds of cutting planes, each of which solves every draw."""
 RIDGE = 1e-3
 """Penalty on the coefficients of the regression, relative to the variance of what they multiply."""
 WORTHWHILE = 0.1
 """Share of the fall that the cuts promise, at which a step is taken."""
 FIRST_RADIUS = 0.5
-"""Half of the first box, relative to the prices on stocks and to the objective."""
-MOST_PARTS = 32
-"""Parts of the prices on stocks that are improved one by one."""
+"""Half of the first box, in prices on services relative to the objective."""
+STOCK_WIDTH = 0.4
+"""The box of prices on stocks beside that, in parts of what a stock is worth per deviation of what is new."""
 SHORT, OUT_OF_REACH = 1e-3, 20.0
 """How far a service lacks, at which price relative to the objective, that no policy reaches."""
-LEAST_FALL = 1e-6
+LEAST_FALL = 1e-4
 """Relative fall that is promised below which no more cuts are made."""
 
 
@@ -94,15 +94,23 @@ class Sample:
             by_stock.append(-np.einsum("tk,tn,tf->knf", knots, apart, new))
         return np.array(by_stock), self.levels(trial) - prices.demand
 
-    def regression(self, trial: PriceTrial) -> Floats:
-        """Return θ such that Σ_f θ_tf φ_f(s_t) is what stocks are worth, as near as it can be, by least squares."""
+    def regression(self, trial: PriceTrial) -> tuple[Floats, Floats]:
+        """Return θ such that Σ_f θ_tf φ_f(s_t) is what stocks are worth, as near as it can be, by least squares.
+
+        Returns:
+            θ, and its scale: what a stock is worth, root mean square, per deviation of φ; shapes (knots, stores,
+            functions). A stock whose worth never changes where the future is known may well deserve a price.
+        """
         worth = np.array([program.stock_values(certificate) for program, _, certificate in self._optima(trial)])
         features = np.array([program.draw.features[1:] for program in self.programs])
+        size, deviation = np.sqrt((worth**2).mean(axis=(0, 1))), features.std(axis=(0, 1))
+        scales = np.divide(size[:, None], deviation, out=np.zeros((len(size), len(deviation))), where=deviation > 0)
         worth, features = worth - worth.mean(axis=0), features - features.mean(axis=0)
         knots = knot_weights(worth.shape[1], len(trial.prices.stock))
         shape = len(trial.prices.stock), features.shape[2]
         table = np.einsum("itf,tk->itkf", features, knots).reshape(-1, shape[0] * shape[1])
-        return np.moveaxis(_regression(table, worth).reshape(*shape, -1), 1, 2)
+        theta = np.moveaxis(_regression(table, worth).reshape(*shape, -1), 1, 2)
+        return theta, np.broadcast_to(scales, theta.shape)
 
     def _optima(self, trial: PriceTrial) -> list[tuple[DrawProgram, Floats, Certificate]]:
         solutions = []
@@ -145,21 +153,19 @@ def fit_prices(
         demand=demand if len(demand) else np.zeros(services),
     )
     sample, judges = Sample(programs[::2]), Sample(programs[1::2])
-    trial, no_parts = sample(free), np.zeros((0, *free.stock.shape))
+    trial = sample(free)
     if len(demand):
-        trial = improve(sample, [trial], no_parts, scale)[-1]
+        trial = improve(sample, [trial], np.zeros_like(free.stock), scale)[-1]
         _check_reach(sample, trial, scale)
     progress(0.3)
     clairvoyant, trials = trial.prices, [trial]
     if functions:
         # while nothing is charged, the stocks from which it counts do not matter
         reference, response = sample.reference(trial)
-        trials = [replace(trial, prices=replace(clairvoyant, reference=reference, response=response))]
-        for _ in range(REGRESSIONS):
-            trials.append(sample(replace(trials[0].prices, stock=sample.regression(trials[-1]))))
-        progress(0.5)
-        trials += improve(sample, [trials[0], trials[-1]], _parts(trials[-1].prices.stock), scale, len(demand) > 0)
-        progress(0.8)
+        trial = replace(trial, prices=replace(clairvoyant, reference=reference, response=response))
+        theta, scales = sample.regression(trial)
+        trials = [trial, sample(replace(trial.prices, stock=theta))]
+        trials.append(improve(sample, trials, scales, scale, len(demand) > 0, progress)[-1])
     means = [judges(trial.prices).values.mean() for trial in trials]
     progress(1.0)
     return clairvoyant, trials[int(np.argmin(means))].prices
@@ -177,38 +183,49 @@ def _check_reach(sample: Sample, trial: PriceTrial, scale: float) -> None:
 
 
 def improve(
-    sample: Sample, trials: Sequence[PriceTrial], parts: Floats, scale: float, has_demand: bool = True
+    sample: Sample,
+    trials: Sequence[PriceTrial],
+    stock_scales: Floats,
+    scale: float,
+    has_demand: bool = True,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> list[PriceTrial]:
     """Lower the mean of what is proved by cutting planes in a box around the best prices so far.
 
     Args:
         sample: the draws.
-        trials: where to begin: without prices on stocks, and with the sum of all parts.
-        parts: of the prices on stocks; how much of each is charged is what is improved, (parts, *θ.shape).
+        trials: where to begin.
+        stock_scales: of θ, shape (knots, stores, functions); 0 of what is to stay as it is.
         scale: of the objective.
         has_demand: whether prices on services may change.
+        progress: called with the share that is done, from 0.3 on.
 
     Returns:
         Trials each of which was better than all before, the best last.
     """
-    count, cuts = len(parts), _Cuts(len(parts) + len(trials[0].prices.service))
-    places = [np.concatenate([np.full(count, float(i)), trial.prices.service]) for i, trial in enumerate(trials)]
-    for trial, at in zip(trials, places, strict=True):
-        cuts.add(sample, trial, parts, at)
+    free, services = stock_scales > 0, len(trials[0].prices.service)
+    count = int(free.sum())
+    units = np.concatenate([STOCK_WIDTH * stock_scales[free], np.full(services, scale)])
+    width = np.concatenate([np.ones(count), np.full(services, 1.0 if has_demand else 0.0)])
+    cuts, places = _Cuts(), []
+    for trial in trials:
+        places.append(np.concatenate([trial.prices.stock[free], trial.prices.service]) / units)
+        cuts.add(sample, trial, free, units, places[-1])
     first = int(np.argmin([trial.values.mean() for trial in trials]))
     best, best_at = trials[first], places[first]
-    width = np.concatenate([np.ones(count), np.full(len(best_at) - count, scale if has_demand else 0.0)])
     improvements, radius = [best], FIRST_RADIUS
-    for _ in range(CUTS):
+    for k in range(CUTS):
+        progress(0.3 + 0.6 * k / CUTS)
         box = np.stack([best_at - radius * width, best_at + radius * width])
         box[0, count:] = np.maximum(box[0, count:], 0.0)
         at, estimate = cuts.lowest(box)
         fall = best.values.mean() - estimate
-        if fall <= LEAST_FALL * scale:
+        if fall <= LEAST_FALL * abs(estimate):
             break
-        prices = replace(best.prices, stock=np.einsum("p,pknf->knf", at[:count], parts), service=at[count:])
-        trial = sample(prices)
-        cuts.add(sample, trial, parts, at)
+        stock = best.prices.stock.copy()
+        stock[free] = (at * units)[:count]
+        trial = sample(replace(best.prices, stock=stock, service=(at * units)[count:]))
+        cuts.add(sample, trial, free, units, at)
         decrease = best.values.mean() - trial.values.mean()
         radius *= 2.0 if decrease > 0.5 * fall else 1.0 if decrease > WORTHWHILE * fall else 0.5
         if decrease > 0:
@@ -220,33 +237,32 @@ def improve(
 class _Cuts:
     """For each draw the planes below what is proved of it, which is convex in the prices."""
 
-    def __init__(self, size: int) -> None:
-        self._size = size
+    def __init__(self) -> None:
         self._slopes: list[Floats] = []
         self._offsets: list[Floats] = []
 
-    def add(self, sample: Sample, trial: PriceTrial, parts: Floats, at: Floats) -> None:
+    def add(self, sample: Sample, trial: PriceTrial, free: NDArray[np.bool_], units: Floats, at: Floats) -> None:
         """Add the planes that touch it at a trial."""
         by_stock, by_service = sample.slopes(trial)
-        slopes = np.concatenate([np.einsum("iknf,pknf->ip", by_stock, parts), by_service], axis=1)
+        slopes = np.concatenate([by_stock[:, free], by_service], axis=1) * units
         self._slopes.append(slopes)
         self._offsets.append(trial.values - slopes @ at)
 
     def lowest(self, box: Floats) -> tuple[Floats, float]:
         """Return where in a box, shape (2, size), the mean of the highest plane of each draw is least, and this."""
         slopes, offsets = np.concatenate(self._slopes), np.concatenate(self._offsets)
-        draws = len(self._offsets[0])
+        draws, size = len(self._offsets[0]), slopes.shape[1]
         # minimise the mean of η_i subject to slope·y + offset ≤ η_i
         above = -sparse.vstack([sparse.eye_array(draws)] * len(self._offsets))
         solution = optimize.linprog(
-            np.concatenate([np.zeros(self._size), np.full(draws, 1.0 / draws)]),
+            np.concatenate([np.zeros(size), np.full(draws, 1.0 / draws)]),
             A_ub=sparse.hstack([sparse.csr_array(slopes), above], format="csr"),
             b_ub=-offsets,
             bounds=[*box.T.tolist(), *[(None, None)] * draws],
         )
         if solution.x is None:
             raise CirlError(f"HiGHS did not solve the program of the prices: {solution.message}")
-        return solution.x[: self._size], float(solution.fun)
+        return solution.x[:size], float(solution.fun)
 
 
 def _regression(table: Floats, target: Floats) -> Floats:
@@ -257,16 +273,3 @@ def _regression(table: Floats, target: Floats) -> Floats:
     solution = np.linalg.solve(normal, table.T @ target.reshape(len(table), -1))
     coefficients: Floats = np.divide(solution, size[:, None], out=np.zeros_like(solution), where=size[:, None] > 0)
     return coefficients
-
-
-def _parts(theta: Floats) -> Floats:
-    """Return θ as a sum of parts by stock and function, or if these are many by function, (parts, knots, stores, …)."""
-    _, stores, functions = theta.shape
-    by_stock = stores * functions <= MOST_PARTS
-    places = np.ndindex(stores, functions) if by_stock else ((slice(None), f) for f in range(functions))
-    parts = []
-    for store, function in places:
-        part = np.zeros_like(theta)
-        part[:, store, function] = theta[:, store, function]
-        parts.append(part)
-    return np.array([part for part in parts if part.any()]).reshape(-1, *theta.shape)
