@@ -14,7 +14,8 @@ from rich.console import Console
 from cirl_marl import Network, bound, load_network
 from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.statistics import Aggregate
-from cirl_marl.optimum.uncertain_bound import Sampling, UncertainBound
+from cirl_marl.optimum.draw_proofs import Sampling
+from cirl_marl.optimum.uncertain_bound import UncertainBound
 
 SERVICE = 0.99
 WORLDS = {"copper_net": "outages", "carbo_net": "weather"}

@@ -39,11 +39,11 @@ from cirl_marl.network.disturbances import BlockBootstrap, DisturbanceEffect, Ga
 from cirl_marl.network.innovations import innovations
 from cirl_marl.network.uncertainty import Spread, draw_network, expected_network
 from cirl_marl.optimum import NoCertificate, draws, price_fit, uncertain_bound
+from cirl_marl.optimum.draw_proofs import Sampling
 from cirl_marl.optimum.draws import Draw, DrawProgram, DrawProof, Prices
 from cirl_marl.optimum.mpc import MPC
 from cirl_marl.optimum.price_fit import KNOTS, PriceTrial, Sample, fit_prices, improve
 from cirl_marl.optimum.solver import SolverFailure, solve
-from cirl_marl.optimum.uncertain_bound import Sampling
 
 Floats = NDArray[np.float64]
 CHAIN = Markov(values=(1.0, 0.3), matrix=((0.7, 0.3), (0.4, 0.6)))
@@ -174,6 +174,7 @@ def prices_of(network: Network, seed: int, size: float, demand: float, level_pri
         response=rng.uniform(0, 1, (3 * functions, stores)),
         service=np.full(len(network.services), level_price),
         demand=np.full(len(network.services), demand),
+        shocks=np.zeros((2, functions)),
     )
 
 
@@ -219,11 +220,24 @@ def test_fitted_prices_close_what_foresight_is_worth() -> None:
     best = paths.best(demand)[0]
     drawn = np.random.default_rng(1).choice(len(paths.chance), 64, p=paths.chance)
     informed, fitted = (
-        paths.mean(prices)
-        for prices in fit_prices([paths.programs[i] for i in drawn], np.array([demand]), 1.0)
+        paths.mean(prices) for prices in fit_prices([paths.programs[i] for i in drawn], np.array([demand]), 1.0)
     )
     assert informed - best > 0.05 * abs(best)
     assert best - 1e-8 <= fitted <= informed - 0.5 * (informed - best)
+
+
+@pytest.mark.medium
+def test_luck_of_draws_narrows_the_interval() -> None:
+    """What shocks by themselves add has mean 0 over all paths, and follows what draws are worth."""
+    network = works(4)
+    paths = Paths.of(network)
+    drawn = np.random.default_rng(1).choice(len(paths.chance), 32, p=paths.chance)
+    informed, _ = fit_prices([paths.programs[i] for i in drawn], np.array([DEMAND]), 1.0)
+    values = np.array([program.prove(program.with_prices(informed)).value for program in paths.programs])
+    luck = np.array([informed.luck(program.draw.new) for program in paths.programs])
+    assert paths.chance @ luck == pytest.approx(0.0, abs=1e-12)
+    spreads = [paths.chance @ (part - paths.chance @ part) ** 2 for part in (values, values - luck)]
+    assert spreads[1] < 0.5 * spreads[0]
 
 
 def test_improvement_never_rises(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -588,7 +602,7 @@ def test_entries_have_their_gap(found: Any) -> None:
         (entry,), figure, beside = row.entries, row.figure("expected_gap"), row.figure("foresight_gap")
         merit = entry.circularity + (entry.rollout.episode_levels[:, 0] - DEMAND) * found.prices.service[0]
         assert figure is not None and beside is not None
-        assert figure.value == pytest.approx((found.value - merit.mean()) / found.scale)
+        assert figure.value == pytest.approx((found.values - merit).mean() / found.scale)
         assert figure.high > 0.0
         levels = entry.rollout.episode_levels
         gaps = found.gaps(entry.circularity, levels, with_foresight=True)

@@ -4,10 +4,11 @@ from cirl_marl.optimum.admissible import NoCertificate
 from cirl_marl.optimum.bounds import Bound, Envelope, bound, envelope, gap
 from cirl_marl.optimum.certificate import Certificate, Verification
 from cirl_marl.optimum.cross_entropy import Incumbent, search, search_each, standard_candidates
+from cirl_marl.optimum.draw_proofs import Sampling
 from cirl_marl.optimum.improve import improve_plan
 from cirl_marl.optimum.planned_episodes import Plan, simulate_plan
 from cirl_marl.optimum.smooth import smooth_plan
-from cirl_marl.optimum.uncertain_bound import Sampling, UncertainBound
+from cirl_marl.optimum.uncertain_bound import UncertainBound
 
 __all__ = [
     "Bound",

@@ -17,6 +17,7 @@ from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import frozen_record, positional_record
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
 from cirl_marl.optimum.certificate import Certificate, Verification, verify
+from cirl_marl.optimum.draw_proofs import Sampling
 from cirl_marl.optimum.options import (
     DEGREE,
     by_stage,
@@ -28,7 +29,7 @@ from cirl_marl.optimum.options import (
 )
 from cirl_marl.optimum.program import Program, Programs, circularity_weights
 from cirl_marl.optimum.solver import FEASIBLE, Basis, Infeasible, solve
-from cirl_marl.optimum.uncertain_bound import Sampling, UncertainBound, uncertain_bound
+from cirl_marl.optimum.uncertain_bound import UncertainBound, uncertain_bound
 
 
 def relative(difference: ArrayLike, reference: ArrayLike) -> Floats:

@@ -22,7 +22,7 @@ from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.certificate import Certificate
-from cirl_marl.optimum.draws import DrawProgram, DrawProof, Prices, knot_weights, past_of
+from cirl_marl.optimum.draws import DrawProgram, DrawProof, Prices, knot_weights, past_of, shocks
 from cirl_marl.optimum.solver import Basis
 
 KNOTS = 3
@@ -31,6 +31,8 @@ CUTS = 30
 """Most rounds of cutting planes, each of which solves every draw."""
 RIDGE = 1e-3
 """Penalty on the coefficients of the regression, relative to the variance of what they multiply."""
+SHOCK_RIDGE = 0.3
+"""The same for what shocks add to draws, of which there are few."""
 WORTHWHILE = 0.1
 """Share of the fall that the cuts promise, at which a step is taken."""
 FIRST_RADIUS = 0.5
@@ -151,6 +153,7 @@ def fit_prices(
         response=np.zeros((past_of(first.features).shape[1], stores)),
         service=np.zeros(services),
         demand=demand if len(demand) else np.zeros(services),
+        shocks=np.zeros((2, functions)),
     )
     sample, judges = Sample(programs[::2]), Sample(programs[1::2])
     trial = sample(free)
@@ -166,9 +169,21 @@ def fit_prices(
         theta, scales = sample.regression(trial)
         trials = [trial, sample(replace(trial.prices, stock=theta))]
         trials.append(improve(sample, trials, scales, scale, len(demand) > 0, progress)[-1])
-    means = [judges(trial.prices).values.mean() for trial in trials]
+    verdicts = [judges(trial.prices) for trial in trials]
     progress(1.0)
-    return clairvoyant, trials[int(np.argmin(means))].prices
+    best = int(np.argmin([verdict.values.mean() for verdict in verdicts]))
+    draws = [program.draw.new for program in (*sample.programs, *judges.programs)]
+    return (
+        replace(clairvoyant, shocks=_worth_of_shocks(draws, trials[0], verdicts[0])),
+        replace(trials[best].prices, shocks=_worth_of_shocks(draws, trials[best], verdicts[best])),
+    )
+
+
+def _worth_of_shocks(draws: Sequence[Floats], *trials: PriceTrial) -> Floats:
+    """Return κ, by regression of what is proved of draws on what is new in them."""
+    table = np.array([shocks(new).ravel() for new in draws])
+    values = np.concatenate([trial.values for trial in trials])
+    return _regression(table, values - values.mean(), SHOCK_RIDGE).reshape(2, -1)
 
 
 def _check_reach(sample: Sample, trial: PriceTrial, scale: float) -> None:
@@ -265,11 +280,11 @@ class _Cuts:
         return solution.x[:size], float(solution.fun)
 
 
-def _regression(table: Floats, target: Floats) -> Floats:
+def _regression(table: Floats, target: Floats, ridge: float = RIDGE) -> Floats:
     """Return the coefficients of the columns of a table by ridge regression, (columns, …); of those that are 0 none."""
     size = table.std(axis=0)
     table = np.divide(table, size, out=np.zeros_like(table), where=size > 0)
-    normal = table.T @ table + RIDGE * len(table) * np.eye(table.shape[1])
+    normal = table.T @ table + ridge * len(table) * np.eye(table.shape[1])
     solution = np.linalg.solve(normal, table.T @ target.reshape(len(table), -1))
     coefficients: Floats = np.divide(solution, size[:, None], out=np.zeros_like(solution), where=size[:, None] > 0)
     return coefficients
