@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -53,30 +53,14 @@ def import_(
     from cirl_marl.importing.assembly import import_flows
     from cirl_marl.importing.balances import ProcessKind
 
-    patterns = {
-        "nonrenewable_reservoir": reservoir,
-        "landfill": landfill,
-        "incinerator": incinerator,
-        "environment": environment,
-        "technosphere": outside,
-    }
+    patterns = {"nonrenewable_reservoir": reservoir, "landfill": landfill, "incinerator": incinerator}
+    patterns |= {"environment": environment, "technosphere": outside}
+    roles = {role: names for role, names in patterns.items() if names}
+    ask = _ask if sys.stdin.isatty() else None
+    options: dict[str, Any] = {"stores": store or (), "regions": region or (), "reconcile": reconcile, "sheet": sheet}
+    options |= {"unit": unit, "year": year, "title": title, "source": source}
     with bar("checking") as progress:
-        report = import_flows(
-            flows,
-            out,
-            stocks,
-            roles={role: names for role, names in patterns.items() if names},
-            stores=store or (),
-            regions=region or (),
-            ask=_ask if sys.stdin.isatty() else None,
-            reconcile=reconcile,
-            sheet=sheet,
-            unit=unit,
-            year=year,
-            title=title,
-            source=source,
-            progress=progress,
-        )
+        report = import_flows(flows, out, stocks, roles=roles, ask=ask, progress=progress, **options)
     table = report.table
     for kind in ProcessKind:
         if names := report.processes.of(kind):
@@ -161,19 +145,8 @@ def fit(
     conditions = dict(condition.partition("=")[::2] for condition in rows or ())
     if unclear := [condition for condition in rows or () if "=" not in condition]:
         raise CirlError(f"--where {unclear[0]}: write COLUMN=TEXT, such as country=Japan")
-    fits = fit_disturbances(
-        table,
-        column,
-        kind=kind,
-        logarithm=not plain,
-        trend=trend,
-        unit=unit,
-        interval=interval,
-        seasons=seasons,
-        rows=conditions,
-        times=times,
-        source=source,
-    )
+    options: dict[str, Any] = {"kind": kind, "trend": trend, "unit": unit, "interval": interval, "seasons": seasons}
+    fits = fit_disturbances(table, column, logarithm=not plain, rows=conditions, times=times, source=source, **options)
     for name, (change, error) in fits.trends.items():
         amount = f"{change:.3g} ± {error:.2g} {unit}" if unit else f"{100 * change:.3g} ± {100 * error:.2g} %"
         errors.print(f"{name}: {fits.rows}; its trend, which is left out, is {amount} a row", soft_wrap=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -63,18 +63,9 @@ def new(
     if not products:
         in_use = typer.prompt("How much of it is in use", type=float) if in_use is None else in_use
         lifetime = typer.prompt("How many years it stays in use", type=float) if lifetime is None else lifetime
-    first = FirstCycle(
-        material=material,
-        mass=mass,
-        in_use=1.0 if in_use is None else in_use,
-        lifetime=1.0 if lifetime is None else lifetime,
-        recycled=recycled_share,
-        growth=growth,
-        start=start,
-        years=years,
-        products=products,
-    )
-    write_first(first, file)
+    options: dict[str, Any] = {"growth": growth, "start": start, "years": years, "products": products}
+    options |= {"in_use": 1.0 if in_use is None else in_use, "lifetime": 1.0 if lifetime is None else lifetime}
+    write_first(FirstCycle(material=material, mass=mass, recycled=recycled_share, **options), file)
     common.say(f"wrote {file}; next: cirl plan {file} --control optimum --min-service 1, and cirl train {file}")
 
 
