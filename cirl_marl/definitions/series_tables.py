@@ -43,12 +43,9 @@ def _elapsed_times(moments: tuple[YearOrDate, ...], start: YearOrDate, unit: str
 
 def inline_series(table: AmountSeries, unit: float, clock: Clock) -> Series:
     """Return a series written in the definition; ``unit`` is that of its values."""
-    return Series(
-        times=clock.times(tuple(table.times), table.time_unit),
-        values=tuple(value * unit for value in table.values),
-        interpolation=table.interpolation,
-        until=None if table.until is None else clock.times((table.until,), table.time_unit)[0],
-    )
+    times, values = clock.times(tuple(table.times), table.time_unit), tuple(value * unit for value in table.values)
+    until = None if table.until is None else clock.times((table.until,), table.time_unit)[0]
+    return Series(times=times, values=values, interpolation=table.interpolation, until=until)
 
 
 def column_value(

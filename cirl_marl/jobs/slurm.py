@@ -157,12 +157,7 @@ class Queue:
     def _ask(self) -> None:
         self._last_query = time.monotonic()
         # all of the user's: of a list of numbers squeue refuses to answer when it has forgotten a single one
-        answer = subprocess.run(
-            ["squeue", "--noheader", "--me", "--states=all", "--format=%i %T"],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        answer = _answer("squeue", "--noheader", "--me", "--states=all", "--format=%i %T")
         if answer.returncode:
             if self._last_query - self._last_answer > SILENCE:
                 raise RunError(f"Slurm has not answered for {SILENCE:.0f} s: {answer.stderr.strip()}")
@@ -173,17 +168,11 @@ class Queue:
 
     def _end(self, number: str) -> str:
         """Return how a job ended, by the controller while it remembers it, then by accounting if there is one."""
-        answer = subprocess.run(
-            ["scontrol", "--oneliner", "show", "job", number], capture_output=True, text=True, check=False
-        )
+        answer = _answer("scontrol", "--oneliner", "show", "job", number)
         if not answer.returncode and (jobs := re.search(r"JobState=(\w+).* ExitCode=(\d+:\d+)", answer.stdout)):
             return _with_code(*jobs.groups())
-        answer = subprocess.run(
-            ["sacct", "--noheader", "--parsable2", "--allocations", "--format=State,ExitCode", "--jobs", number],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        columns = "--format=State,ExitCode"
+        answer = _answer("sacct", "--noheader", "--parsable2", "--allocations", columns, "--jobs", number)
         state, _, code = answer.stdout.strip().partition("|")
         return "" if answer.returncode or not state else _with_code(state.split()[0], code)
 
@@ -206,6 +195,10 @@ def sbatch_options(settings: Mapping[str, str]) -> list[str]:
     minutes = options["time"]
     options["signal"] = f"B:TERM@{min(WARNING, 15 * int(minutes)) if minutes.isdigit() else WARNING}"
     return [f"--{name}={value}" for name, value in options.items()]
+
+
+def _answer(*command: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def _run(command: Sequence[str], purpose: str, text: str = "", environment: Mapping[str, str] | None = None) -> str:

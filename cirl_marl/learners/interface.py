@@ -162,16 +162,9 @@ def prepare(
         raise CirlError(f"network '{env.network.name}': no compartment has a control, so nothing can learn")
     full_recipe.check_agents(env.agents)
     settings.pop("scenario", None)
-    config = RunConfig(
-        network=env.network.name,
-        scenario=env.network.scenario_name,
-        agents=env.agents,
-        recipe=full_recipe,
-        seed=_whole("seed", seed, 0),
-        steps=steps,
-        envs=copies,
-        options=settings,
-    )
+    task: dict[str, Any] = {"network": env.network.name, "scenario": env.network.scenario_name, "agents": env.agents}
+    task |= {"recipe": full_recipe, "seed": _whole("seed", seed, 0), "steps": steps, "envs": copies}
+    config = RunConfig(**task, options=settings)
     if checkpoint_every is not None and not checkpoint_every >= 0:
         raise CirlError(f"checkpoint_every must be seconds of at least 0, got {checkpoint_every!r}")
     training = Training(config, env, checkpoint_every=checkpoint_every)

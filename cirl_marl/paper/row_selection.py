@@ -40,14 +40,8 @@ def select_rows(
     if not names:
         raise CirlError(f"there is no tuned recipe agents/paper_*.toml for {environment or algorithm or 'any'}")
     return [
-        PaperRow(
-            environment=paper_environment.name,
-            algorithm=name,
-            settings=kind,
-            steps=steps or paper_environment.steps,
-            seed=seed,
-        )
-        for paper_environment, name, kind in names
+        PaperRow(environment=target.name, algorithm=name, settings=kind, steps=steps or target.steps, seed=seed)
+        for target, name, kind in names
         for seed in range(seeds)
     ]
 

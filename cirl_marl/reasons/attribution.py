@@ -10,7 +10,7 @@ References: Sundararajan, Taly and Yan 2017, Axiomatic attribution for deep netw
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
@@ -154,17 +154,10 @@ def _integrated_gradients(
     distance = (rows[sample] - mean)[:, [places[0] for places in columns.places]].astype(float)
     squares = (distance**2).sum(axis=0)
     sizes, slopes, residuals = np.zeros(len(columns.names)), [], []
+    options: dict[str, Any] = {"method": "gausslegendre", "n_steps": POINTS, "internal_batch_size": SAMPLES * POINTS}
+    options |= {"additional_forward_args": memory or None}
     for entry in columns.entries.tolist():
-        gradients, delta = method.attribute(
-            inputs,
-            baseline,
-            target=entry,
-            additional_forward_args=memory or None,
-            n_steps=POINTS,
-            method="gausslegendre",
-            internal_batch_size=SAMPLES * POINTS,
-            return_convergence_delta=True,
-        )
+        gradients, delta = method.attribute(inputs, baseline, target=entry, return_convergence_delta=True, **options)
         with torch.no_grad():
             change = (function(inputs, *memory) - function(baseline, *memory))[:, entry]
         parts = gradients.detach().numpy().astype(float)
