@@ -245,10 +245,7 @@ def _levels(least: float, most: float, points: int) -> list[float]:
 
 def _policy_points(runs: Sequence[RunDirectory], episodes: int) -> Iterator[Point]:
     for entry in compare(runs, ["neutral"], episodes=episodes, bounds=False).entries:
-        yield Point(
-            kind="neutral" if entry.run is None else "trained",
-            service=float(entry.rollout.least_service.mean()),
-            circularity=float(entry.circularity.mean()),
-            weight=None if entry.run is None else entry.run.config.options["circularity_weight"],
-            seed=entry.seed,
-        )
+        run, kind = entry.run, "neutral" if entry.run is None else "trained"
+        service, circularity = float(entry.rollout.least_service.mean()), float(entry.circularity.mean())
+        weight = None if run is None else run.config.options["circularity_weight"]
+        yield Point(kind=kind, service=service, circularity=circularity, weight=weight, seed=entry.seed)

@@ -164,9 +164,6 @@ def evaluate(
                 success_count[copy] = False
         report("evaluating", len(returns), episodes)
     env.close()
-    return EvaluationFigures(
-        episodes=len(returns),
-        mean=float(np.mean(returns)),
-        deviation=float(np.std(returns)),
-        success=100 * float(np.mean(successes)) if knows_success else None,
-    )
+    mean, deviation = float(np.mean(returns)), float(np.std(returns))
+    success = 100 * float(np.mean(successes)) if knows_success else None
+    return EvaluationFigures(episodes=len(returns), mean=mean, deviation=deviation, success=success)

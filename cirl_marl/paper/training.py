@@ -136,7 +136,7 @@ def _train_network(
     with tempfile.TemporaryDirectory() as folder:
         stop_clock = _stopwatch()
         training = train(arguments["network"], recipe, directory=Path(folder) / "run", report=watch, **options)
-        seconds, cpu_seconds = stop_clock()
+        times = stop_clock()
         assert training.run is not None
         metrics = training.run.metrics()
     agent = training.env.agents[0]
@@ -147,10 +147,9 @@ def _train_network(
         ends=np.repeat(np.asarray(metrics["env_steps"], dtype=int), copies).tolist(),
         returns=np.repeat(metrics[f"return:{agent}"], copies).tolist(),
         steps=training.joint_steps * copies,
-        seconds=seconds,
-        cpu_seconds=cpu_seconds,
         settings={"copies": copies, **settings, **describe(environment)},
         options=recipe.environment,
+        **times,
     )
 
 
@@ -193,19 +192,12 @@ def _train_copies(
     except (CirlError, ValueError):  # what torch's distributions and the environments say of NaN
         if _is_finite(model):
             raise
-    seconds, cpu_seconds = stop_clock()
+    figures: dict[str, Any] = {"steps": model.num_timesteps, **stop_clock()}
     ends, returns = _episodes_of(monitors)
     env.close()
-    return TrainingRecord(
-        predict=_predictor(model, env) if _is_finite(model) else None,
-        ends=ends,
-        returns=returns,
-        steps=model.num_timesteps,
-        seconds=seconds,
-        cpu_seconds=cpu_seconds,
-        settings={"copies": copies, **settings, **describe(environment)},
-        options={},
-    )
+    predict = _predictor(model, env) if _is_finite(model) else None
+    settings = {"copies": copies, **settings, **describe(environment)}
+    return TrainingRecord(predict=predict, ends=ends, returns=returns, settings=settings, options={}, **figures)
 
 
 def _is_finite(model: BaseAlgorithm) -> bool:
@@ -235,7 +227,7 @@ def _episodes_of(monitors: list[Monitor[Any, Any]]) -> tuple[list[int], list[flo
     return [end for end, _, _ in episodes], [value for _, _, value in episodes]
 
 
-def _stopwatch() -> Callable[[], tuple[float, float]]:
+def _stopwatch() -> Callable[[], dict[str, float]]:
     """Start to measure; the function returned gives wall time and processor time since then, in seconds."""
     wall, cpu = time.perf_counter(), time.process_time()
-    return lambda: (time.perf_counter() - wall, time.process_time() - cpu)
+    return lambda: {"seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - cpu}
