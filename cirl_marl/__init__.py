@@ -94,6 +94,7 @@ if TYPE_CHECKING:
     from cirl_marl.optimum.mpc import MPC as MPC
     from cirl_marl.optimum.planned_episodes import Plan as Plan
     from cirl_marl.optimum.planned_episodes import simulate_plan as simulate_plan
+    from cirl_marl.optimum.schedule_ascent import improve_schedule as improve_schedule
     from cirl_marl.optimum.smooth import smooth_plan as smooth_plan
     from cirl_marl.reasons.explanation import explain as explain
     from cirl_marl.reasons.inverse import infer as infer
@@ -145,6 +146,7 @@ _MODULES = {
     "optimum.improve": "improve_plan",
     "optimum.mpc": "MPC",
     "optimum.planned_episodes": "Plan simulate_plan",
+    "optimum.schedule_ascent": "improve_schedule",
     "optimum.smooth": "smooth_plan",
     "reasons.explanation": "explain",
     "reasons.inverse": "infer",

@@ -26,6 +26,7 @@ NOISE = {"action_noise": {"kind": "ornstein_uhlenbeck", "sigma": 0.3}}
 CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any], dict[str, Any]]] = {
     "PPO": ("PPO", PPO, {}, {}),
     "PPO stacked": ("PPO", PPO, {}, {"engine": "stacked"}),
+    "PPO's policies by exact gradients": ("PPO", PPO, {}, {"engine": "gradients"}),
     "PPO with state-dependent noise": ("PPO", {**PPO, "use_sde": True, "sde_sample_freq": 3}, {}, {}),
     "PPO shared": ("PPO", PPO, {"scheme": "shared"}, {}),
     "PPO joint": ("PPO", PPO, {"scheme": "joint"}, {}),

@@ -33,7 +33,8 @@ def train(
     steps: Annotated[int | None, typer.Option(min=1, help="Environment steps, summed over the copies.")] = None,
     envs: Annotated[int | None, typer.Option(min=1, help="Copies of the environment.")] = None,
     engine: Annotated[
-        str | None, typer.Option(help="auto, lockstep or stacked (same learners as one); default: the recipe's.")
+        str | None,
+        typer.Option(help="auto, lockstep, stacked (same learners as one) or gradients; default: the recipe's."),
     ] = None,
     min_service: Annotated[
         float | None,

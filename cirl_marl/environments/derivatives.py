@@ -9,21 +9,11 @@ from numpy.typing import ArrayLike
 
 from cirl_marl.dynamics.adjoint import Adjoint, IntervalInputs
 from cirl_marl.dynamics.supply_adjoint import SupplyAdjoint
-from cirl_marl.environments.state import State
+from cirl_marl.environments.state import Interval
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import ControlError
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record
-
-
-@positional_record
-class Interval:
-    """What the way back through an interval needs."""
-
-    before: Annotated[State, "the state at its start"]
-    after: Annotated[State, "the state at its end"]
-    actions: Annotated[Floats, "stacked actions, shape (entries, B)"]
-    controls: Annotated[Floats, "controls with what supplies made up for, shape (controls, B)"]
 
 
 @positional_record
@@ -62,12 +52,9 @@ class Derivatives:
 
     def advance(self, actions: Floats) -> tuple[Interval, Outputs]:
         """Hold stacked actions, shape (entries, B), for an interval, as ``MultiAgentVectorEnv.advance`` does."""
-        env, before = self.env, self.env.physical
-        outcome = env.advance(actions)
-        interval = Interval(before, env.physical, actions, env.controls)
-        return interval, Outputs(
-            env.physical.stock, outcome.circularity_mean, outcome.levels, env.observe_into(self._table)
-        )
+        env, outcome = self.env, self.env.advance(actions)
+        interval, observation = env.interval, env.observe_into(self._table)
+        return interval, Outputs(env.physical.stock, outcome.circularity_mean, outcome.levels, observation)
 
     def pull_back(self, interval: Interval, adjoint: Outputs, path_adjoint: Floats) -> tuple[Floats, Floats, Floats]:
         """Return derivatives by masses at the start, actions and draws, given those by what an interval ended with.

@@ -85,6 +85,17 @@ class Outcome:
     success: Annotated[Mapping[str, NDArray[np.bool_]], "whether the task of a compartment's model is done, shape (B,)"]
 
 
+@with_field_docs
+@dataclass(slots=True)
+class Interval:
+    """The last control interval, from which its derivatives follow."""
+
+    before: Annotated[State, "the state at its start"]
+    after: Annotated[State, "the state at its end, before copies whose episode is over start anew"]
+    actions: Annotated[Floats, "stacked actions, shape (entries, B)"]
+    controls: Annotated[Floats, "controls with what supplies made up for, shape (controls, B)"]
+
+
 def _description(network: Network, copies: int, agents: tuple[str, ...], uncertain: bool) -> str:
     return (
         f"network '{network.name}', scenario '{network.scenario_name}', {network.episode.horizon} steps, "

@@ -21,7 +21,7 @@ from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.observations import ObservationLayout
 from cirl_marl.environments.rewards import Credit, Scoring
 from cirl_marl.environments.starts import Starts
-from cirl_marl.environments.state import Outcome, Snapshot, State
+from cirl_marl.environments.state import Interval, Outcome, Snapshot, State
 from cirl_marl.errors import CirlError, ControlError, unknown_name
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.calendar import years
@@ -73,6 +73,7 @@ class MultiAgentVectorEnv:
         controls: their values in the last interval, in the rows of ``network.control_rows``, (controls, num_envs).
         state_names: nodes, ``compartment.state`` of the inner states, ``arc.row`` of the masses of batch arcs, and
             ``disturbance.state`` of the disturbances, in the order of ``state()``.
+        interval: the last interval, as derivatives need it.
         episodes: episodes begun in each copy, those gone back to included, shape (num_envs,).
     """
 
@@ -147,6 +148,7 @@ class MultiAgentVectorEnv:
         self.state_names = (*self.rows.start_names, *self.rows.batch_names, *variant.processes.state_names)
         self.episodes: Integers = np.zeros(num_envs, dtype=np.intp)
         self.controls: Floats = np.empty((len(self.dynamics.neutral), num_envs))
+        self.interval: Interval
         self._state: State | None = None
         self._services = [service.id for service in variant.services]
         self._costs = [f"cost_{service}" for service in self._services]
@@ -377,6 +379,7 @@ class MultiAgentVectorEnv:
         self._state = State(
             transition.stock, transition.inner, flow, measures, step, state.factors, batch_mass, *totals, *drawn
         )
+        self.interval = Interval(state, self._state, actions, controls)
         observation = self.layout.observe(quantities, step / horizon, levels, self._sight(self._state))
         success = dynamics.inner.successes(transition.inner, controls)
         return Outcome(observation, reward, local, circularity, mean, levels, service, flow, step >= horizon, success)

@@ -30,7 +30,7 @@ from cirl_marl.learners.views import CENTRAL_CRITIC, AllAtOnce, OneAgent, Scheme
 from cirl_marl.network import Network
 from cirl_marl.network.elements import Moment, Node, Observe, Reward, Role
 
-EngineName = Literal["auto", "lockstep", "stacked"]
+EngineName = Literal["auto", "lockstep", "stacked", "gradients"]
 ENGINES: tuple[EngineName, ...] = get_args(EngineName)
 Count = Annotated[int, Field(strict=True, gt=0)]
 Limit = Annotated[Number, Field(gt=0)]
@@ -184,7 +184,8 @@ class Run(Settings):
     engine: EngineName = Field(
         "auto",
         description="lockstep: each learner's own learn(), unmodified; stacked: learners of the same settings as one, "
-        "the same algorithm up to rounding and several times as fast; auto: stacks those that can be",
+        "the same algorithm up to rounding and several times as fast; auto: stacks those that can be; gradients: "
+        "policies of PPO by exact gradients of the simulator instead of the algorithm",
     )
     evaluations: Annotated[int, Field(strict=True, ge=0)] = Field(
         20, description="evaluations during a run, the best of which is the checkpoint that counts; 0: the last one"

@@ -26,7 +26,7 @@ from cirl_marl.learners.learner import Learner, derived_seed, has_tensorboard
 from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, Streams, TrainingStop
 from cirl_marl.learners.policies import Policies
 from cirl_marl.learners.run_directory import RunConfig, RunDirectory, TableFile, steps_of
-from cirl_marl.learners.stacked.conditions import obstacle, stacks
+from cirl_marl.learners.stacked.conditions import gradient_obstacle, gradient_stacks, obstacle, stacks
 from cirl_marl.learners.stacked.stack import Stack
 from cirl_marl.learners.start import begin_again, begin_from
 from cirl_marl.learners.validation import MULTIPLIER_FROM, Score, ServiceMultiplier, validation_score
@@ -177,9 +177,9 @@ class Training:
         for name in callbacks:
             if name not in self.learners:
                 raise CirlError(f"callbacks: {unknown_name('learner', name, self.learners)}")
-            if self.config.recipe.run.engine == "stacked":
+            if (engine := self.config.recipe.run.engine) in ("stacked", "gradients"):
                 title = self.learners[name].agent_env.title
-                raise CirlError(f"callbacks: {title}: engine stacked calls none; use engine lockstep or auto")
+                raise CirlError(f"callbacks: {title}: engine {engine} calls none; use engine lockstep or auto")
 
     def stackable(self, callbacks: Mapping[str, BaseCallback]) -> list[Learner]:
         """Return the learners that the engine of the run lets run as one with others.
@@ -187,11 +187,13 @@ class Training:
         Raises:
             RecipeError: if one cannot that has to; names it and what is in the way.
         """
-        engine, members = self.config.recipe.run.engine, []
+        engine, members = self.config.recipe.run.engine, list[Learner]()
         for learner in self.learners.values():
             title, reason = learner.agent_env.title, obstacle(learner)
-            if engine == "stacked" and reason is not None:
-                place = f"recipe '{self.config.recipe.name}': {title}: engine stacked"
+            if engine == "gradients":
+                reason = gradient_obstacle(learner, next(iter(self.learners.values())).spec)
+            if engine in ("stacked", "gradients") and reason is not None:
+                place = f"recipe '{self.config.recipe.name}': {title}: engine {engine}"
                 raise RecipeError(f"{place}: {reason}; use engine auto or lockstep")
             if reason is None and engine == "lockstep":
                 reason = "engine lockstep"
@@ -354,7 +356,13 @@ def run_together(
     """
     callbacks = callbacks or {}
     members = [learner for training in trainings for learner in training.stackable(callbacks)]
-    stacks_of_learners = stacks(members, device)
+    run_settings = trainings[0].config.recipe.run
+    if run_settings.engine == "gradients":
+        stacks_of_learners = gradient_stacks(
+            [(training.learners.values(), run_settings.min_service) for training in trainings], device
+        )
+    else:
+        stacks_of_learners = stacks(members, device)
     member_ids = {id(learner) for learner in members}
     began = time.perf_counter()
 

@@ -16,6 +16,8 @@ from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtr
 
 from cirl_marl.learners.learner import Learner
 from cirl_marl.learners.policies import CentralCriticPolicy
+from cirl_marl.learners.recipe import LearnerSettings
+from cirl_marl.learners.stacked.gradient_ascent import GradientStack
 from cirl_marl.learners.stacked.on_policy import RolloutStack
 from cirl_marl.learners.stacked.perceptrons import ACTIVATIONS, linear_layers
 from cirl_marl.learners.stacked.search import SearchStack, copies_per_candidate, parts_of
@@ -24,6 +26,31 @@ from cirl_marl.learners.stacked.stack import Stack
 OPTIMISERS = (torch.optim.Adam, torch.optim.AdamW, torch.optim.RMSprop, torch.optim.SGD, RMSpropTFLike)
 """Optimisers that work element by element, so that zeros stay zero."""
 EXTRACTORS = {ActorCriticPolicy: FlattenExtractor, CentralCriticPolicy: CombinedExtractor}
+
+
+def gradient_stacks(trainings: Iterable[tuple[Iterable[Learner], float | None]], device: str) -> list[Stack]:
+    """Return the learners of each training as one, which climb exact gradients; with the service that it demands."""
+    return [GradientStack([*learners], device, min_service) for learners, min_service in trainings]
+
+
+def gradient_obstacle(learner: Learner, settings: LearnerSettings) -> str | None:
+    """Return why exact gradients cannot move a learner as they do one of ``settings``; None if they can."""
+    if type(learner.model) is not PPO:
+        return f"algorithm {learner.spec.algorithm}: its policies are those of PPO"
+    reason = _on_policy_obstacle(learner.model, learner.spec.policy)
+    alike = {"kind", "role", "agents"}
+    if reason is not None:
+        return reason
+    if learner.spec.scheme != "independent":
+        return f"scheme {learner.spec.scheme}: each agent has a policy of its own"
+    if learner.demonstrator is not None:
+        return "demonstrations: there are none"
+    if learner.spec.model_dump(exclude=alike) != settings.model_dump(exclude=alike):
+        return "its settings: they must be those of all others, as the gradient goes through what all do"
+    env = learner.agent_env.views[0].env
+    if env.reward_mode != "team":
+        return f"reward '{env.reward_mode}': what is climbed is that of 'team', with the mean of circularity"
+    return None
 
 
 def stacks(learners: Iterable[Learner], device: str) -> list[Stack]:

@@ -101,6 +101,30 @@ class Perceptrons:
                 gradient = self.activation.gradient(gradient, values[place])
 
 
+def chain(perceptrons: Perceptrons, values: Sequence[Tensor], gradient: Tensor) -> list[Tensor]:
+    """Return the gradients of the inputs and of each layer's sums, shape (learners, samples, …), from the outputs'."""
+    gradients = [gradient]
+    for place in reversed(range(len(perceptrons.layers))):
+        before = torch.bmm(gradients[0], perceptrons.layers[place].weight)
+        gradients.insert(0, perceptrons.activation.gradient(before, values[place]) if place else before)
+    return gradients
+
+
+def write_gradients(
+    perceptrons: Perceptrons, values: Sequence[Sequence[Tensor]], gradients: Sequence[Sequence[Tensor]]
+) -> None:
+    """Write the gradients of weights and biases, summed over batches of samples.
+
+    Of each batch there is what ``forward`` and ``chain`` gave.
+    """
+    for place, into in enumerate(perceptrons.gradients):
+        inputs = torch.cat([batch[place] for batch in values], dim=1)
+        gradient = torch.cat([batch[place + 1] for batch in gradients], dim=1)
+        _multiply(gradient.mT, inputs, into.weight)
+        if into.bias is not None:
+            into.bias.copy_(gradient.sum(dim=1))
+
+
 def pieces(learners: int, cells: int, device: torch.device) -> Iterator[slice]:
     """Yield the learners that are worked on at once, where each has so many ``cells``; off the CPU all of them."""
     at_once = learners if device.type != "cpu" else max(1, CELLS // cells)

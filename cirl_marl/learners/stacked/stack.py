@@ -126,6 +126,14 @@ class StackedInputs:
                     length = len(self.actor_columns[i]) if key == "observation" else None  # the rest is padding
                     yield (i, slice(length)), self._moments[key], moments
 
+    @property
+    def slopes(self) -> NDArray[np.floating]:
+        """By what normalisers multiply differences of observations now, shape (N, 1, entries) or (1, 1, 1)."""
+        normaliser = self._members[0].normaliser
+        if normaliser is None or not normaliser.norm_obs:
+            return np.ones((1, 1, 1))
+        return np.asarray(1.0 / np.sqrt(self._moments["observation"].var + normaliser.epsilon)[:, None])
+
     def _enter(self, i: int, observation: Any) -> None:
         for key, part in self._parts.items():
             rows = observation[key] if isinstance(observation, dict) else observation

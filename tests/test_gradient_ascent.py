@@ -1,0 +1,92 @@
+"""Policies that climb exact gradients: what they climb, and who cannot."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from cirl_marl import RecipeError, train
+from cirl_marl.learners.recipe import LearnerSettings, Recipe, Run
+from cirl_marl.learners.stacked.gradient_ascent import GradientStack
+
+PARAMETERS = {"policy_kwargs": {"net_arch": [4]}, "max_grad_norm": 1e9, "n_steps": 4, "batch_size": 8}
+
+
+def recipe(run: dict[str, Any] | None = None, **learner: Any) -> Recipe:
+    """Return a recipe for a few episodes of four intervals in two copies."""
+    settings = {"algorithm": "PPO", "parameters": PARAMETERS, "normalise": {"observation": True, "reward": False}}
+    return Recipe(
+        name="climb",
+        title="climb",
+        run=Run(
+            **({"steps": 24, "envs": 2, "engine": "gradients", "evaluations": 0, "min_service": 0.99} | (run or {}))
+        ),
+        environment={"reward": "team", "circularity": "mean", "horizon": 4},
+        learner=LearnerSettings.model_validate(settings | learner),
+    )
+
+
+def test_gradients_go_through_the_policies(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are those of the mean of λ̄/c plus priced levels over the copies, by every weight of every policy."""
+    ascend, checked = GradientStack._ascend, []
+
+    def check(stack: GradientStack, progress_remaining: float) -> None:
+        tape, env, prices = stack._tape, stack._env, stack._prices.copy()
+        monkeypatch.setattr(stack._weights.optimiser, "step", lambda: None)
+        ascend(stack, progress_remaining)
+        monkeypatch.undo()
+        matrix, now, controls = stack._weights.matrix, env.physical, env.controls
+
+        def objective() -> float:
+            env.go_back(tape[0][0].before, controls)
+            inputs = tape[0][1][0]
+            for t in range(len(tape)):
+                outputs = stack._weights.actor.forward(inputs)[-1].numpy()
+                actions = np.empty_like(tape[0][0].actions)
+                for rows, entries in zip(outputs, stack._acted, strict=True):
+                    actions[entries] = np.clip(rows[:, : entries.stop - entries.start], -1, 1).T
+                env.advance(actions)
+                if t + 1 < len(tape):
+                    # what is seen changes by the slopes of the normaliser, from what was seen on the tape
+                    seen, before = (env._observe(state) for state in (env.physical, tape[t][0].after))
+                    change = np.zeros(inputs.shape)
+                    for rows, span in zip(change, stack._observed, strict=True):
+                        rows[:, : span.stop - span.start] = (seen[span] - before[span]).T
+                    inputs = tape[t + 1][1][0] + torch.as_tensor(change * tape[t + 1][2], dtype=torch.float32)
+            state = env.physical
+            value = state.circularity.mean() / env.network.objective.circularity_scale
+            return float(value + prices @ state.service.mean(axis=1)) / len(tape)
+
+        largest = float(stack._weights.gradient.abs().max())
+        for place in np.random.default_rng(0).integers(0, matrix.numel(), 20):
+            row, column = divmod(int(place), matrix.shape[1])
+            value, ends = float(matrix[row, column]), []
+            for shift in (0.02, -0.02, 0.01, -0.01):
+                matrix[row, column] = value + shift
+                ends.append(objective())
+            matrix[row, column] = value
+            slope = (8 * (ends[2] - ends[3]) - (ends[0] - ends[1])) / 0.12  # of fourth order
+            assert -float(stack._weights.gradient[row, column]) == pytest.approx(slope, abs=1e-3 * largest)
+        env.go_back(now, controls)
+        checked.append(largest)
+
+    monkeypatch.setattr(GradientStack, "_ascend", check)
+    train("carbo_net", recipe({"steps": 8}))
+    assert len(checked) == 1 and checked[0] > 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "options", "reason"),
+    [
+        ({"algorithm": "A2C", "parameters": {}}, {}, "algorithm A2C: its policies are those of PPO"),
+        ({"scheme": "joint"}, {}, "scheme joint: each agent has a policy of its own"),
+        ({}, {"reward": "mixed"}, "reward 'mixed'"),
+    ],
+)
+def test_who_cannot_climb(changes: dict[str, Any], options: dict[str, Any], reason: str) -> None:
+    """Is told why, before anything is learnt."""
+    with pytest.raises(RecipeError, match=f"engine gradients: {reason}"):
+        train("copper_net", recipe(**changes), **options)
