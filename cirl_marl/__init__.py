@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from cirl_marl.environments.registration import register as register
 
 if TYPE_CHECKING:
+    from cirl_marl.adapters.differentiable import DifferentiableEnv as DifferentiableEnv
     from cirl_marl.controllers.basic import Constant as Constant
     from cirl_marl.controllers.basic import Controller as Controller
     from cirl_marl.controllers.basic import Neutral as Neutral
@@ -109,6 +110,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _MODULES = {
+    "adapters.differentiable": "DifferentiableEnv",
     "controllers.basic": "Constant Controller Neutral Random",
     "controllers.lqr": "LQR",
     "controllers.rollout": "Rollout interval_ends rollout",

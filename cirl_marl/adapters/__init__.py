@@ -5,6 +5,7 @@ Each module needs the package that it is for, which this library does not instal
 - ``adapters.torchrl``: ``TorchRLEnv``, the batched environment, all copies in one step;
 - ``adapters.benchmarl``: ``NetworkTask``, the same as a task;
 - ``adapters.rllib``: ``RLlibEnv``, whose agents RLlib steps one environment at a time;
+- ``adapters.differentiable``: ``DifferentiableEnv``, through which gradients of PyTorch flow; it needs nothing more;
 - ``adapters.supersuit``: ``SharedPolicyEnv``, all agents as copies of one, for a plain Stable-Baselines3 model.
 """
 

@@ -53,8 +53,12 @@ class Derivatives:
     def advance(self, actions: Floats) -> tuple[Interval, Outputs]:
         """Hold stacked actions, shape (entries, B), for an interval, as ``MultiAgentVectorEnv.advance`` does."""
         env, outcome = self.env, self.env.advance(actions)
-        interval, observation = env.interval, env.observe_into(self._table)
-        return interval, Outputs(env.physical.stock, outcome.circularity_mean, outcome.levels, observation)
+        outputs = Outputs(env.physical.stock, outcome.circularity_mean, outcome.levels, self.observation())
+        return env.interval, outputs
+
+    def observation(self) -> Floats:
+        """Return the present stacked observation in double precision, shape (entries of all agents, B)."""
+        return self.env.observe_into(self._table)
 
     def pull_back(self, interval: Interval, adjoint: Outputs, path_adjoint: Floats) -> tuple[Floats, Floats, Floats]:
         """Return derivatives by masses at the start, actions and draws, given those by what an interval ended with.
