@@ -301,6 +301,16 @@ def test_actions_that_are_no_numbers(action: Any, message: str) -> None:
             env.step({**actions, "mine": shown})
 
 
+def test_actions_of_more_than_double_precision() -> None:
+    """They do what the nearest numbers in double precision do, inside of compartments too."""
+    rewards = []
+    for precision in (np.longdouble, float):
+        env = parallel_env("net_zero")
+        env.reset(seed=0)
+        rewards.append(env.step({agent: np.full(shape, 0.1, precision) for agent, shape in _shapes(env).items()})[1])
+    assert rewards[0] == rewards[1]
+
+
 def _in_batch(action: Any) -> Any:
     return action[None] if isinstance(action, np.ma.MaskedArray) else action
 

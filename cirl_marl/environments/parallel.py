@@ -190,7 +190,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         except (KeyError, RuntimeError, TypeError, ValueError):
             joint = np.empty(0)
         fits = joint.shape == (self._entries, 1) and len(actions) == len(self.possible_agents)
-        if not fits or joint.dtype.kind not in "biuf":
+        if not fits or joint.dtype.kind not in "biuf" or joint.dtype.itemsize > 8:  # long doubles
             return self.batch.stack({agent: self._as_row(agent, action) for agent, action in actions.items()})
         return joint
 
