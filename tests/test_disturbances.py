@@ -651,8 +651,8 @@ def test_what_stands_still_throughout_can_be_drawn() -> None:
         replace(network, arcs=tuple(replace(a, rate=0.0) if a.id == "leak" else a for a in network.arcs), disturbed={})
 
 
-def test_a_scenario_may_have_a_disturbance_of_another_kind(tmp_path: Path) -> None:
-    """Its table takes the place of the other, and who alone sees it stands in the table of disturbances."""
+def test_a_scenario_may_have_a_disturbance_of_another_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its table takes the place of the other; who alone sees it is shown, and pictures of draws name the scenario."""
     path = tmp_path / "line.toml"
     write_network(line(EVERYWHERE), path)
     table = '[scenarios.stops.disturbances.price]\nkind = "markov"\nvalues = [1, 0.5]\nlengths = [4, 2]\n'
@@ -662,6 +662,12 @@ def test_a_scenario_may_have_a_disturbance_of_another_kind(tmp_path: Path) -> No
     assert network.disturbed == load_network(path).disturbed
     shown = CliRunner().invoke(app, ["show", str(path), "--scenario", "stops"])
     assert re.search(r"price +│ markov +│ +0.5 … 1 +│ now, by leak", shown.output)
+    titles = list[str]()
+    monkeypatch.setattr("cirl_marl.report.samples.save_bands", lambda *_, title: titles.append(title))
+    command = ["simulate", str(path), "--samples", "2", "--steps", "2", "--out", str(tmp_path)]
+    for options in ([], ["--scenario", "stops"]):
+        assert CliRunner().invoke(app, [*command, *options]).exit_code == 0
+    assert titles == ["line, neutral control, 2 samples", "line, scenario stops, neutral control, 2 samples"]
 
 
 @pytest.mark.medium

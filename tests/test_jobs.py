@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -225,6 +226,20 @@ def test_places_that_cannot_be(
     with pytest.raises(CirlError, match=message):
         run_jobs(written(tmp_path), tmp_path / "jobs", **options)  # type: ignore[arg-type]
     assert list(tmp_path.iterdir()) == []
+
+
+def test_logs_of_a_node_that_dies_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What Ray prints of one is that it is dead, unless the user wants it otherwise."""
+    seen: list[str] = []
+    key = "RAY_DEDUP_LOGS_SKIP_REGEX"
+    monkeypatch.setattr(places, "import_module", lambda name: seen.append(os.environ[key]))
+    monkeypatch.setenv(key, "mine")
+    places.check_place("ray")
+    monkeypatch.delenv(key)
+    places.check_place("ray")
+    assert seen[0] == "mine"
+    assert re.search(seen[1], "Raylet is terminated. Termination is unexpected. Last 20 lines of the Raylet logs:")
+    assert not re.search(seen[1], "The node with node id: 1 has been marked dead because the detector has missed too")
 
 
 @pytest.mark.slow

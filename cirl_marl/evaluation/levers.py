@@ -235,9 +235,10 @@ class _Trials:
         return Trial(run, alone.objective)
 
     def _loss(self, name: str) -> float:
-        """Return what all levers lose without one, by their bounds."""
-        bound_without = self.without(name).bound
-        return 0.0 if bound_without is None else self._plan.objective - bound_without
+        """Return what all levers lose without one, by their bounds or in the simulator."""
+        trial = self.without(name)
+        loss = self._worth(self.together.run) - self._worth(trial.run)
+        return loss if trial.bound is None else max(loss, self._plan.objective - trial.bound)
 
     def _promise(self, part: Bound) -> float:
         return self._bound(part.agents).objective if self._solves else self._worth(simulate_plan(part))
