@@ -14,6 +14,7 @@ from test_optimum import RESERVE, TIP, USE, order, valve
 from test_optimum import small as timed
 
 from cirl_marl import Arc, Network, Service, load_network
+from cirl_marl.network.disturbances import DisturbanceEffect, Markov
 from cirl_marl.network.series import in_intervals
 from cirl_marl.optimum import Bound, NoCertificate, bound
 from cirl_marl.optimum.admissible import Admissible
@@ -21,8 +22,10 @@ from cirl_marl.optimum.options import by_stage
 from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.solver import solve
 from cirl_marl.optimum.vintages import Lifetimes
+from cirl_marl.reasons.explanation import explain
 from cirl_marl.reasons.prices import shadow_prices, with_bound
-from cirl_marl.reasons.sentences import price_sentences
+from cirl_marl.reasons.sentences import paragraphs, price_sentences
+from cirl_marl.report.explanations import price_rows
 
 Floats = NDArray[np.floating]
 
@@ -43,6 +46,29 @@ def test_a_stock_that_only_leaks() -> None:
     assert found.room[0].sum() == pytest.approx(0.01 * 0.5 * 100 * 0.4 * math.exp(-0.4 * 0.5 * 4), rel=1e-3)
     np.testing.assert_allclose(found.room[1], 0.0, atol=1e-5)
     assert found.demand.shape == (8, 0) and not found.level.size
+
+
+@pytest.mark.medium
+def test_prices_by_state() -> None:
+    """A reserve that leaks ξ times as fast, for ever: as above with a·ξ, on average over intervals."""
+    arc = Arc(id="extraction", donor="reserve", recipient="use", rate=0.4, control=valve(0.5, 2.0))
+    network = replace(
+        timed([RESERVE, USE], [arc]),
+        disturbances={"luck": Markov(values=(0.5, 1.0), lengths=(1e12, 1e12))},
+        disturbed={"arcs.extraction.rate": DisturbanceEffect(by="luck")},
+    )
+    found = explain(network)
+    (by_state,) = found.state_prices
+    np.testing.assert_array_equal(by_state.states, [[0.5, 0.5], [1.0, 1.0]])
+    left = 4 - 0.5 * np.arange(1, 8)
+    for factor, worth in zip((0.5, 1.0), by_state.stock, strict=True):
+        assert worth[0] == pytest.approx(-(1 - np.exp(-0.4 * 0.5 * factor * left)).mean() / 4, rel=1e-3)
+        assert worth[1] == pytest.approx(0.0, abs=1e-9)
+    (sentence,) = dict(paragraphs(found))["What stocks are worth when"]
+    assert "while luck is 0.5 and" in sentence
+    rows = [row for row in price_rows(found) if row[0] == "stock while luck is 1 to 1"]
+    assert [row[1] for row in rows] == ["reserve", "use"]
+    assert float(rows[0][3]) == pytest.approx(by_state.stock[1, 0])
 
 
 def test_a_service_that_needs_its_throughput() -> None:

@@ -41,7 +41,8 @@ def explain(
 ) -> None:
     """Say why: what more of a stock, of demand or of room is worth, what agents look at, and rules that act like them.
 
-    Prices are read off the certificate of the bound. Inputs are integrated gradients of each agent's action; the
+    Prices are read off the certificate of the bound, of a disturbed network also by the state of each
+    disturbance. Inputs are integrated gradients of each agent's action; the
     most important ones are held at their means, to see what becomes of λ̄. Rules are small decision trees, judged by
     what they lose in the policy's place. Inputs and rules need the extra explain. `cirl report RUN --html` shows what
     is found.

@@ -34,15 +34,20 @@ def resting_on_rows(bound: Bound, admissible: Admissible) -> Bound:
     one lies on rows as well, as a rule, and either may have the multiplier; more of a stock moves both. Where no rows
     hold it the objective rises a little; it is a bound all the same.
     """
-    problem, free = bound.problem, _start_dependent(admissible, bound.problem.layout)
+    wider = with_wide_boxes(bound.problem, admissible)
+    solution = solve(wider, bound.basis, label="the program of the shadow prices")
+    return replace(bound, problem=wider, solution=solution.plan, certificate=solution.certificate, basis=solution.basis)
+
+
+def with_wide_boxes(problem: Program, admissible: Admissible) -> Program:
+    """Return a program in which boxes that follow from the start hold nothing."""
+    free = _start_dependent(admissible, problem.layout)
     high = problem.high.reshape(-1, problem.layout.size).copy()
     largest = high.max(axis=0)
     # a stock that nothing reaches has a box of 0, which no factor widens
     largest[free & (largest == 0)] = high.max()
     high[:, free] = WIDER * np.maximum(high, largest)[:, free]
-    wider = replace(problem, high=high.ravel())
-    solution = solve(wider, bound.basis, label="the program of the shadow prices")
-    return replace(bound, problem=wider, solution=solution.plan, certificate=solution.certificate, basis=solution.basis)
+    return replace(problem, high=high.ravel())
 
 
 def _start_dependent(admissible: Admissible, layout: Layout) -> NDArray[np.bool_]:

@@ -18,12 +18,14 @@ from cirl_marl.evaluation.comparison import part_of, starting_stocks
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Network
 from cirl_marl.network.declarations import frozen_record
+from cirl_marl.network.uncertainty import expected_network
 from cirl_marl.optimum import NoCertificate
 from cirl_marl.reasons import extras
 from cirl_marl.reasons.attribution import AgentInputs, attribute_inputs
 from cirl_marl.reasons.interventions import Recorder
 from cirl_marl.reasons.prices import ShadowPrices, shadow_prices
 from cirl_marl.reasons.rules import LEAVES, TeamRules, distil_rules
+from cirl_marl.reasons.state_prices import StatePrices, state_prices
 
 PARTS = ("prices", "inputs", "rules")
 """What can be explained: of a network the first alone."""
@@ -39,6 +41,7 @@ class Explanation:
     checkpoint: Annotated[str, "of the run that acts; empty for a network"] = ""
     episodes: Annotated[int, "in which policies were watched; 0 for a network"] = 0
     prices: Annotated[ShadowPrices | None, "shadow prices"] = None
+    state_prices: Annotated[tuple[StatePrices, ...], "prices of stocks by the state of what disturbs a network"] = ()
     no_prices: Annotated[str, "why there are none; empty if there are, or nobody asked"] = ""
     inputs: Annotated[tuple[AgentInputs, ...], "what each agent looks at; empty if nobody asked"] = ()
     rules: Annotated[TeamRules | None, "what each agent does, in rules"] = None
@@ -58,7 +61,8 @@ def explain(
 ) -> Explanation:
     """Explain a network, or what the policies of a run do in it.
 
-    Shadow prices are those of the best plan from the middle of the initial ranges; of a run, from the mean of the
+    Shadow prices are those of the best plan from the middle of the initial ranges, of a disturbed network for what is
+    expected, and beside them by the state of each disturbance; of a run, from the mean of the
     starts of its episodes, and with the service that the policies deliver there.
 
     Args:
@@ -88,9 +92,15 @@ def explain(
     if run is None:
         assert not isinstance(source, RunDirectory)
         network = (load_network(source) if isinstance(source, str | Path) else source).scenario(scenario)
-        report = part_of(progress, "shadow prices", 0.0, 1.0)
-        prices = shadow_prices(network, min_service=min_service, progress=report)
-        return Explanation(network=network, about=network.name, prices=prices)
+        half = 0.5 if network.disturbed else 1.0
+        plain, report = network, part_of(progress, "shadow prices", 0.0, half)
+        if network.disturbed:
+            plain = expected_network(network)
+        prices = shadow_prices(plain, min_service=min_service, progress=report)
+        by_state: tuple[StatePrices, ...] = ()
+        if network.disturbed:
+            by_state = state_prices(network, prices.level, part_of(progress, "prices by state", half, half))
+        return Explanation(network=network, about=network.name, prices=prices, state_prices=by_state)
     if scenario is not None:
         raise CirlError(f"scenario '{scenario}' goes with a network; a run has its own")
     if episodes < 2:

@@ -18,9 +18,12 @@ from cirl_marl.reasons.explanation import Explanation
 from cirl_marl.reasons.input_signals import TIME, Signal
 from cirl_marl.reasons.prices import ShadowPrices
 from cirl_marl.reasons.rules import Condition, Leaf, Rule
+from cirl_marl.reasons.state_prices import StatePrices
 
 MOST_PRICES = 5
 """Most stocks and agents of which prices are told in sentences."""
+MOST_STATE_PRICES = 3
+"""Most stocks whose prices by state are told of each disturbance."""
 SMALL = 1e-6
 """Of the largest price of a kind: below it nothing is worth telling."""
 TOLERANCE = 0.02
@@ -35,6 +38,9 @@ def paragraphs(explanation: Explanation) -> Iterator[tuple[str, list[str]]]:
         prices.append(f"There are no shadow prices: {explanation.no_prices}.")
     if explanation.prices is not None or explanation.no_prices:
         yield "What is worth what", prices
+    if explanation.state_prices:
+        by_state = (state_sentences(network, prices) for prices in explanation.state_prices)
+        yield "What stocks are worth when", [sentence for texts in by_state for sentence in texts]
     sentences = {inputs.agent: [input_sentence(network, inputs)] for inputs in explanation.inputs}
     for rule in () if explanation.rules is None else explanation.rules.rules:
         sentences[rule.agent] = sentences.get(rule.agent, []) + rule_sentences(network, rule)
@@ -81,6 +87,22 @@ def price_sentences(prices: ShadowPrices) -> list[str]:
                 f"If the {end} bound of {compartment_label(network, bound.agents[a])} were one per cent {direction}, λ̄"
                 f" could be {number(float(room[side, a]))} {mass} higher."
             )
+    return sentences
+
+
+def state_sentences(network: Network, prices: StatePrices) -> list[str]:
+    """Say of which stocks the price differs most by the state of a disturbance, and what it is."""
+    spread, mass = np.ptp(prices.stock, axis=0), network.mass_unit
+    sentences = []
+    for i in np.argsort(-spread, kind="stable")[:MOST_STATE_PRICES].tolist():
+        if spread[i] > SMALL * max(float(np.abs(prices.stock).max()), 1e-300):
+            parts = [
+                f"{number(float(price))} {mass} of λ̄ while {readable(prices.disturbance)} is "
+                + (number(low) if low == high else f"{number(low)} to {number(high)}")
+                for (low, high), price in zip(prices.states.tolist(), prices.stock[:, i], strict=True)
+            ]
+            label = compartment_label(network, network.stores[i].id)
+            sentences.append(f"One more {mass} in {label} is worth {joined_text(parts)}.")
     return sentences
 
 

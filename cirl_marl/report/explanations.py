@@ -45,7 +45,7 @@ def write_reasons(explanation: Explanation, folder: Path, **options: Any) -> lis
     """
     names = ["reasons.txt", FILE]
     sections = list(sentences.paragraphs(explanation))
-    tables = {"prices.csv": _price_rows, "inputs.csv": _input_rows, "rules.csv": _rule_rows}
+    tables = {"prices.csv": price_rows, "inputs.csv": _input_rows, "rules.csv": _rule_rows}
     with publish_folder(folder) as draft:
         text = "\n\n".join("\n".join([heading, *sentences]) for heading, sentences in sections)
         (draft / "reasons.txt").write_text(text + "\n", encoding="utf-8")
@@ -119,7 +119,8 @@ def _interval(aggregate: Aggregate) -> str:
     return f"{aggregate.value:+.3g} [{aggregate.low:.3g}, {aggregate.high:.3g}]"
 
 
-def _price_rows(explanation: Explanation) -> Rows:
+def price_rows(explanation: Explanation) -> Rows:
+    """Yield a table with a row for each price, by interval or by the state of a disturbance."""
     yield ["more of", "compartment or service", "interval", "rise of λ̄", "unit"]
     if explanation.prices is None:
         return
@@ -128,6 +129,11 @@ def _price_rows(explanation: Explanation) -> Rows:
     for i, node in enumerate(network.stores):
         for time, price in zip(times, prices.stock[:, i].tolist(), strict=True):
             yield ["stock at the start", node.id, time, _digits(price), f"{mass} per {mass}"]
+    for by_state in explanation.state_prices:
+        for (low, high), worth in zip(by_state.states.tolist(), by_state.stock, strict=True):
+            state = f"stock while {by_state.disturbance} is {low:g} to {high:g}"
+            for node, price in zip(network.stores, worth.tolist(), strict=True):
+                yield [state, node.id, "all", _digits(price), f"{mass} per {mass}"]
     for s, service in enumerate(network.services):
         unit = mass if service.quantity == "stock" else f"{mass}/{network.time_unit}"
         for time, price in zip(times, prices.demand[:, s].tolist(), strict=True):
