@@ -37,7 +37,9 @@ from benchmarks.generated import (
     yearly_network,
 )
 from cirl_marl import load_network, parallel_env
+from cirl_marl.environments.derivatives import Derivatives
 from cirl_marl.environments.parallel import NetworkParallelEnv
+from cirl_marl.environments.state import State
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.learners.interface import train, train_seeds
 from cirl_marl.learners.recipe import Recipe, load_recipe
@@ -72,6 +74,7 @@ class Measurement(StrEnum):
     YEARLY = "yearly"
     WORLD = "world"
     DISTURBED = "disturbed"
+    GRADIENTS = "gradients"
 
 
 @dataclass(frozen=True, slots=True)
@@ -404,8 +407,39 @@ def disturbances() -> list[Figure]:
     return [Figure(what, f"{ratio:.0%}", "≥ 70 %", ratio >= 0.7, "whole episodes, restarts included; median of rounds")]
 
 
+def gradients() -> list[Figure]:
+    """Measure an episode with its exact gradient by actions, start and disturbances against the episode alone."""
+    figures = []
+    for name, copies, intervals in (("copper_net", 256, 160), ("car_batteries", 64, 25), ("steel_japan", 64, 26)):
+        env = MultiAgentVectorEnv(name, num_envs=copies)
+        env.reset(seed=0)
+        derivatives, start = Derivatives(env), env.physical
+        schedule = np.random.default_rng(0).uniform(-1, 1, (intervals, len(env.actuators.control_rows), copies))
+
+        def episode(env: MultiAgentVectorEnv = env, schedule: NDArray[np.float64] = schedule) -> None:
+            for actions in schedule:
+                env.advance(actions)
+
+        def alone(env: MultiAgentVectorEnv = env, start: State = start, play: Callable[[], None] = episode) -> float:
+            env.go_back(start, env.controls)
+            cost = _seconds(play, 1)
+            env.go_back(start, env.controls)
+            return cost
+
+        with_gradient = partial(_seconds, partial(derivatives.open_loop, schedule), 1)
+        forward, both = _interleaved(5, alone, with_gradient)
+        ratio = median(b / a for a, b in zip(forward, both, strict=True))
+        what = f"{name}, {copies} copies: an episode and its exact gradient / the episode"
+        figures.append(Figure(what, f"{ratio:.1f} ×", "≤ 6 ×", ratio <= 6, "medians of rounds"))
+    return figures
+
+
 MEASURES: dict[Measurement, Callable[[], list[Figure]]] = dict(
-    zip(Measurement, (batched, single, share, lockstep, stacked, arcs, yearly, world, disturbances), strict=True)
+    zip(
+        Measurement,
+        (batched, single, share, lockstep, stacked, arcs, yearly, world, disturbances, gradients),
+        strict=True,
+    )
 )
 
 

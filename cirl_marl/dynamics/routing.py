@@ -166,10 +166,10 @@ class Routing:
         return self._back.substitute(result)
 
     @cached_property
-    def _transposes(self) -> tuple[RowSum, RowSum, RowSum, RowSum, RowSum]:
-        ahead, among, back = (matrix.transpose(reverse=True) for matrix in (self._ahead, self._among, self._back))
+    def _on_sum(self) -> RowSum:
+        """Add what arcs carry that come back to eliminated nodes at the kept nodes that they leave."""
         on, shape = np.arange(len(self._on)), (self.nodes, len(self._on))
-        return ahead, among, back, self._on_to.transpose(), RowSum(self._on_from + self._early.stop, on, 1.0, shape)
+        return RowSum(self._on_from + self._early.stop, on, 1.0, shape)
 
     def worths(self, worth: Floats, routes: IntervalRoutes) -> Floats:
         """Return what is worth a unit that enters each node, in ``places``, of the worth of what passes through each.
@@ -177,14 +177,16 @@ class Routing:
         It is the transpose of ``throughputs``: the worth of throughputs stands in the rows of its result, and is used
         up. Shapes are (nodes, B).
         """
-        ahead, among, back, on_to, on_from = self._transposes
+        ahead, among, back = (matrix.transpose(reverse=True) for matrix in (self._ahead, self._among, self._back))
         early, late = self._early, slice(self._early.stop, self.nodes)
         worth = back.substitute(worth[::-1].copy())[::-1]
         through = np.zeros_like(worth)
         through[early] = (worth[early] * self._inverse)[::-1]
         through = among.substitute(through[::-1].copy())[::-1]
         if late.start < late.stop:
-            kept_rows = on_from.add_to(worth.copy(), on_to(through.copy()) * routes.rate.take(self._on, 0))
+            kept_rows = self._on_sum.add_to(
+                worth.copy(), self._on_to.transpose()(through.copy()) * routes.rate.take(self._on, 0)
+            )
             kept_rows[early] = 0.0
             kept_rows[late] = routes.kept_nodes.worth(kept_rows[late])
             through = through + ahead.substitute(kept_rows[::-1].copy())[::-1]

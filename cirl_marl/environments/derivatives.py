@@ -23,7 +23,9 @@ class Outputs:
     stock: Annotated[Floats, "masses, shape (masses, B)"]
     circularity: Annotated[Floats, "mean of λ over the interval, shape (B,)"]
     levels: Annotated[Floats, "service levels, shape (services, B)"]
-    observation: Annotated[Floats, "stacked observation in double precision, shape (entries of all agents, B)"]
+    observation: Annotated[
+        Floats | None, "stacked observation in double precision, shape (entries of all agents, B); None: nobody looks"
+    ] = None
 
 
 @positional_record
@@ -68,10 +70,16 @@ class Derivatives:
         env, before, after = self.env, interval.before, interval.after
         network, signals, step = env.network, env.layout.signals, before.step
         factors = env.dynamics.factors(before.factors, before.disturbances, step)
-        by_quantity, by_level, by_sight = env.layout.pull_back(adjoint.observation)
         factor_adjoint = None if factors is None else np.zeros_like(factors)
-        levels = adjoint.levels + by_level
-        by_quantity += env.scoring.pull_back(env.quantities(after), step, factors, levels, factor_adjoint)
+        levels, by_seen = adjoint.levels, None
+        if adjoint.observation is not None:
+            by_seen, by_level, by_sight = env.layout.pull_back(adjoint.observation)
+            levels = levels + by_level
+            if env.layout.sights:
+                env.layout.sights.pull_back(after.step, by_sight, path_adjoint)
+        by_quantity = env.scoring.pull_back(env.quantities(after), step, factors, levels, factor_adjoint)
+        if by_seen is not None:
+            by_quantity += by_seen
         by_flow = by_quantity[signals.flows] + network.circularity_adjoint(after.flow) * adjoint.circularity
         by_flow += network.throughput_adjoint(by_quantity[signals.throughputs])
         stock = adjoint.stock + env.rows.masses_adjoint(by_quantity[signals.stocks])
@@ -79,8 +87,6 @@ class Derivatives:
         moved = by_flow / network.episode.control_interval
         result = self._supply.pull_back(inputs, step, env.idle, stock, moved)
         actions, ends = env.actuators.pull_back(interval.actions, step, factors, result.controls)
-        if env.layout.sights:
-            env.layout.sights.pull_back(after.step, by_sight, path_adjoint)
         draws = np.zeros_like(before.factors)
         if factors is not None and factor_adjoint is not None and result.factors is not None:
             factor_adjoint += result.factors
@@ -95,7 +101,7 @@ class Derivatives:
         env, (steps, _, batch) = self.env, actions.shape
         state, controls, services = env.physical, env.controls, len(env.network.services)
         try:
-            tape = [self.advance(action) for action in actions]
+            tape = [(env.advance(action), env.interval) for action in actions]
         finally:
             env.go_back(state, controls)
         by_circularity = np.broadcast_to(np.asarray(circularity, dtype=float), (batch,)) / steps
@@ -104,12 +110,11 @@ class Derivatives:
         stock, draws = np.zeros_like(state.stock), np.zeros_like(state.factors)
         paths, by_action = np.zeros_like(state.disturbances), np.empty(actions.shape)
         for t in reversed(range(steps)):
-            interval, outputs = tape[t]
-            adjoint = Outputs(stock, by_circularity, by_level, np.zeros_like(outputs.observation))
-            stock, by_action[t], drawn = self.pull_back(interval, adjoint, paths)
+            outputs = Outputs(stock, by_circularity, by_level)
+            stock, by_action[t], drawn = self.pull_back(tape[t][1], outputs, paths)
             draws += drawn
-        mean_circularity = np.mean([outputs.circularity for _, outputs in tape], axis=0)
-        mean_levels = np.mean([outputs.levels for _, outputs in tape], axis=0)
+        mean_circularity = np.mean([outcome.circularity_mean for outcome, _ in tape], axis=0)
+        mean_levels = np.mean([outcome.levels for outcome, _ in tape], axis=0)
         return Gradient(mean_circularity, mean_levels, by_action, stock[env.rows.nodes], paths, draws)
 
 

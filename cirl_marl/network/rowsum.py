@@ -85,6 +85,7 @@ class RowSum:
         matrix.sort_indices()
         self.shape, self._starts, self._rows = shape, matrix.indptr, matrix.indices
         self._weights: Floats = matrix.data
+        self._transposes: dict[bool, RowSum] = {}
 
     def __call__(self, values: Floats) -> Floats:
         """Return W x for x of shape (columns, B)."""
@@ -110,14 +111,17 @@ class RowSum:
     def scaled_by(self, factor: float) -> RowSum:
         """Return factor·W."""
         matrix = copy(self)
-        matrix._weights = self._weights * factor
+        matrix._weights, matrix._transposes = self._weights * factor, {}
         return matrix
 
     def transpose(self, *, reverse: bool = False) -> RowSum:
         """Return Wᵀ; with ``reverse`` rows and columns in the opposite order, so that it can ``substitute`` again."""
-        columns = np.repeat(np.arange(self.shape[1]), np.diff(self._starts))
-        rows, ends = (self.shape[0] - 1 - self._rows, self.shape[1] - 1 - columns) if reverse else (self._rows, columns)
-        return RowSum(ends, rows, self._weights, self.shape[::-1])
+        if reverse not in self._transposes:
+            columns, rows = np.repeat(np.arange(self.shape[1]), np.diff(self._starts)), self._rows
+            if reverse:
+                columns, rows = self.shape[1] - 1 - columns, self.shape[0] - 1 - rows
+            self._transposes[reverse] = RowSum(columns, rows, self._weights, self.shape[::-1])
+        return self._transposes[reverse]
 
     def column_sums(self) -> Floats:
         """Return Σ_i W_ik for each column k."""

@@ -32,6 +32,9 @@ from cirl_marl.network import Floats
 
 RATE, DAMPING = 2.0, 10.0
 """r and d of the dual ascent."""
+SPREAD, MIDDLE = 10.0, 0.5
+"""Observations are scaled, most of them between 0 and 1: fresh weights of the first layer are so many times as large
+and centred there, so that hidden units tell apart what differs by a tenth."""
 MARGIN = 5e-4
 """How much more than ``min_service`` is asked for, so that an evaluation assures it."""
 
@@ -51,11 +54,20 @@ class GradientStack(Stack):
         names = [member.name for member in members]
         self._observed = [self._env.layout.slices[name] for name in names]
         self._acted = [self._env.actuators.entries[name] for name in names]
+        if not self._timesteps and members[0].spec.start is None and members[0].normaliser is None:
+            self._spread()
         services = self._env.network.services
         weight = self._env.circularity_weight
         stated = np.array([service.weight for service in services]) * (1.0 - weight) / max(weight, 1e-6)
         self._prices: Floats = getattr(self._models[0], "service_prices", stated)
         self._lacks: Floats = getattr(self._models[0], "service_lacks", np.zeros(len(services)))
+
+    def _spread(self) -> None:
+        """Let hidden units differ over the range of what is observed."""
+        first = self._weights.actor.layers[0]
+        first.weight.mul_(SPREAD)
+        if first.bias is not None:
+            first.bias.sub_(MIDDLE * first.weight.sum(dim=2))
 
     def learn(self, steps: int) -> None:
         """Learn for the share of ``steps`` that is the learners'."""
