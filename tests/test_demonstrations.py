@@ -26,7 +26,7 @@ from cirl_marl.learners.learner import derived_seed
 from cirl_marl.learners.recipe import Demonstrations, Recipe, load_recipe
 from cirl_marl.learners.trainer import Training
 from cirl_marl.learners.views import View
-from cirl_marl.optimum.registry import CONTROLLERS, named_controller
+from cirl_marl.optimum.registry import CONTROLLERS, UNCERTAIN, named_controller
 from cirl_marl.paper.published import ENVIRONMENTS
 from cirl_marl.paper.results import PaperRow
 from cirl_marl.paper.training import train_tuned
@@ -379,9 +379,9 @@ def test_copies_must_be_of_a_network() -> None:
 
 
 def test_controllers_are_those_of_the_library() -> None:
-    """All but the one that needs values."""
+    """All but the one that needs values, and those for what is drawn."""
     known = get_args(Demonstrations.model_fields["controller"].annotation)
-    assert set(known) == set(CONTROLLERS) - {"constant"}
+    assert set(known) == set(CONTROLLERS) - {"constant", *UNCERTAIN}
 
 
 def test_current_observations_are_those_last_returned() -> None:

@@ -28,7 +28,9 @@ For example: cirl new my.toml · cirl plan my.toml --control optimum --min-servi
 cirl train copper_net --seed 0 · cirl report RUN --html page.html
 """
 # Written out, as the modules that know them take longer to import than all else of ``cirl --help``; a test compares.
-CONTROLLERS = "neutral, constant, random, scripted, lqr, mpc, optimum"
+CONTROLLERS = (
+    "neutral, constant, random, scripted, lqr, mpc, optimum, scenario_mpc, best_constant, best_schedule, price_policy"
+)
 REWARDS = "local, circularity, mixed, difference, mixed_difference, local_sum, team"
 LINE_SECONDS = 30.0
 """Between two lines of progress without a terminal."""
@@ -88,7 +90,7 @@ Uncertain = Annotated[
 ]
 MinService = Annotated[
     float | None,
-    typer.Option(min=0.0, max=1.0, help="Mean level of each service, for mpc and optimum; default: all there is."),
+    typer.Option(min=0.0, max=1.0, help="Mean level of each service that plans are for; default: all there is."),
 ]
 
 Html = Annotated[

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from cirl_marl.cli import common
 from cirl_marl.errors import CirlError
 from cirl_marl.jobs import PLACES
+
+if TYPE_CHECKING:
+    from cirl_marl.optimum import UncertainBound
 
 
 @common.app.command(rich_help_panel=common.COMPARISONS)
@@ -32,6 +35,15 @@ def compare(
     seed: common.Seed = 0,
     min_service: common.MinService = None,
     uncertain: common.Uncertain = None,
+    tune: Annotated[
+        int | None,
+        typer.Option(help="Draws of their own on which margins are set to deliver --min-service on average."),
+    ] = None,
+    futures: Annotated[int | None, typer.Option(min=1, help="Futures that scenario_mpc plans for; default: 8.")] = None,
+    bounds: Annotated[bool, typer.Option(help="Whether each episode is held against the best possible.")] = True,
+    bound_draws: Annotated[
+        int | None, typer.Option(help="Draws of the bound for who does not foresee, which are then the episodes.")
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for episodes.csv, summary.csv, summary.json and comparison.png.")
     ] = None,
@@ -43,24 +55,45 @@ def compare(
     The gap is to an upper bound, which no episode from the same start that serves at least as well exceeds.
     mpc and optimum solve linear programs for every episode: minutes for each on the larger networks.
     Where nothing bounds a network, optimum is the best plan that a search by simulation finds, without certificate.
+    Nobody sees what is to come: mpc plans for what is expected from the present on, scenario_mpc for drawn futures,
+    price_policy one interval ahead by the prices of --bound-draws; best_constant and best_schedule do not look at all.
     """
     from cirl_marl.evaluation import compare as compared
     from cirl_marl.report.tradeoffs import comparison_notes, comparison_table, worst_table, write_comparison
 
     names = common.comma_separated(controllers)
     folder, page = None if out is None else common.folder_for(out, "--out"), common.page_for(html)
-    episodes = _enough(16, network, scenario, runs or []) if episodes is None else episodes
-    options: dict[str, Any] = {"episodes": episodes, "seed": seed, "min_service": min_service, "uncertain": uncertain}
+    options: dict[str, Any] = {"seed": seed, "min_service": min_service, "uncertain": uncertain}
+    options |= {"tune": tune, "futures": futures, "bounds": bounds and bound_draws is None}
+    expected = None
+    if bound_draws is None:
+        options["episodes"] = _enough(16, network, scenario, runs or []) if episodes is None else episodes
+    elif network is None or episodes is not None:
+        raise CirlError("--bound-draws goes with --network, and is the number of episodes: leave out --episodes")
+    else:
+        expected = _bound(bound_draws, network, scenario, seed, min_service, uncertain)
     with common.shares() as progress:
-        comparison = compared(runs or [], names, network=network, scenario=scenario, progress=progress, **options)
+        place: dict[str, Any] = {"network": network, "scenario": scenario, "progress": progress}
+        comparison = compared(runs or [], names, uncertain_bound=expected, **place, **options)
     common.console.print(comparison_table(comparison))
     if comparison.network.disturbed:
         common.console.print(worst_table(comparison))
     for note in comparison_notes(comparison):
         common.say(note)
-    files = [] if folder is None else write_comparison(comparison, folder, controllers=names, **options)
+    options |= {"controllers": names, "bound_draws": bound_draws}
+    files = [] if folder is None else write_comparison(comparison, folder, **options)
     for path in [*files, *common.browser_report(page, comparison)]:
         common.say(f"wrote {path}")
+
+
+def _bound(
+    draws: int, network: str, scenario: str | None, seed: int, min_service: float | None, uncertain: bool | None
+) -> UncertainBound:
+    """Return the bound for who does not foresee, on as many draws."""
+    from cirl_marl.optimum import Sampling, bound
+
+    sampling = Sampling(draws=draws, seed=seed, numbers=bool(uncertain))
+    return bound(network, scenario=scenario, min_service=min_service, degree=1, uncertain=sampling)
 
 
 def _enough(certain: int, network: str | None, scenario: str | None, runs: Sequence[Path]) -> int | None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from typing import Annotated
 
 import numpy as np
 
 from cirl_marl.controllers.basic import Arrays, Controller, Planner
+from cirl_marl.environments.present import PresentEnv
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
@@ -18,6 +20,9 @@ EVALUATION_SEEDS = 2**31
 
 ROUNDING = 1e-9
 """Share of a scheduled flow by which what is realised may differ from it without being less."""
+
+CONTROLLER_STREAM = 2
+"""Which child of a seed's sequence controllers of disturbed networks draw from; see ``processes.STREAM``."""
 
 SEED_SPACING = 1_000_000
 """Distance between the first seeds of two evaluations with different ``seed``, so that they share no episode."""
@@ -58,6 +63,7 @@ class Rollout:
     start: Annotated[Floats, "stocks at the start in the first copy, shape (stores,), mass"]
     start_load: Annotated[Floats, "masses that batch arcs hold then, shape (batch arcs,), mass"]
     start_inner: Annotated[Floats, "inner states that an agent may see then, shape (states,)"]
+    control_seconds: Annotated[float, "processor time that the controller took in all, its plans included"]
 
     @property
     def episode_circularity(self) -> Floats:
@@ -92,8 +98,9 @@ def rollout(
     """Run one whole episode in every copy of ``env``, of which copy i is reset with ``seed + i``.
 
     The same seed gives every controller the same start states; what stands in ``start`` is not drawn (see
-    ``MultiAgentVectorEnv.reset``). ``progress`` is called with the share of the work that is done, plans that a
-    controller makes beforehand included, and ``watch`` with the number of intervals done.
+    ``MultiAgentVectorEnv.reset``). Of a disturbed network the controller gets the environment at present, and a seed of
+    its own (``PresentEnv``): what is to come is nowhere to be seen. ``progress`` is called with the share of the work
+    that is done, plans that a controller makes beforehand included, and ``watch`` with the number of intervals done.
 
     >>> from cirl_marl.controllers import Neutral
     >>> shares = []
@@ -107,10 +114,16 @@ def rollout(
     stocks, loads = (masses(before.stock)[:, 0].copy() for masses in (rows.stocks, batches.loads))
     origin = (stocks, loads, before.inner[physics.visible, 0].copy())
     ahead = controller.ahead if isinstance(controller, Planner) else 0.0
+    present = PresentEnv(env) if env.network.disturbed else None
+    clock = time.process_time()
+    actor_env = env if present is None else present
+    if present is not None:  # from its seeds the future could be drawn
+        seed = int(np.random.SeedSequence(seed, spawn_key=(CONTROLLER_STREAM,)).generate_state(1)[0])
     if isinstance(controller, Planner):
-        controller.plan(env, seed, lambda share: progress(ahead * share))
+        controller.plan(actor_env, seed, lambda share: progress(ahead * share))
     else:
-        controller.start(env, seed)
+        controller.start(actor_env, seed)
+    seconds = time.process_time() - clock
     circularity, mean, service = np.empty((3, env.num_envs, steps))
     levels = np.empty((env.num_envs, len(env.network.services), steps))
     local, returns = np.zeros((2, len(env.agents), env.num_envs))
@@ -121,7 +134,12 @@ def rollout(
     controls = np.empty((steps, len(env.dynamics.neutral)))
     shortage = np.zeros((steps, len(orders)))
     for t in range(steps):
-        outcome = env.advance(env.stack(controller.act(observations)))
+        clock = time.process_time()
+        if present is not None:
+            present.follow(env)
+        actions = controller.act(observations)
+        seconds += time.process_time() - clock
+        outcome = env.advance(env.stack(actions))
         controls[t] = env.controls[:, 0]
         if len(orders):
             step = np.full(env.num_envs, t)
@@ -146,7 +164,19 @@ def rollout(
     if values.size:
         values[...] = np.moveaxis(env.physical.disturbances[:-1], 2, 0)
     return Rollout(
-        circularity, mean, service, levels, local, returns, *first_copy, shortage, final, flows, values, *origin
+        circularity,
+        mean,
+        service,
+        levels,
+        local,
+        returns,
+        *first_copy,
+        shortage,
+        final,
+        flows,
+        values,
+        *origin,
+        seconds,
     )
 
 

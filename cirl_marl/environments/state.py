@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -39,6 +39,12 @@ class State:
     def copy(self) -> State:
         """Return the state with arrays of its own."""
         return State(*(getattr(self, part.name).copy() for part in fields(self)))
+
+    def without_future(self) -> State:
+        """Return the state without what disturbances will be: NaN in the intervals after the coming one."""
+        later = np.arange(len(self.processes))[:, None, None] > self.step
+        processes, values = (np.where(later, np.nan, paths) for paths in (self.processes, self.disturbances))
+        return replace(self, processes=processes, disturbances=values)
 
     def replace(self, copies: NDArray[np.bool_], state: State) -> State:
         """Return the state in which some ``copies``, shape (B,), are those of another ``state``."""

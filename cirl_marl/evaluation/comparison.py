@@ -16,6 +16,7 @@ from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.baselines import Baseline, bounds_of_draws, solve_baseline
+from cirl_marl.evaluation.calibration import CLOSE, Calibration, calibrate
 from cirl_marl.evaluation.contenders import Contender, contenders
 from cirl_marl.evaluation.episode_count import MOST_EPISODES, concatenation, enough_episodes, ties
 from cirl_marl.evaluation.figures import gain
@@ -24,6 +25,7 @@ from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum import NoCertificate, gap
+from cirl_marl.optimum.options import demanded_levels
 from cirl_marl.optimum.uncertain_bound import UncertainBound
 
 FIGURES = ("circularity", "gain", "service", "bound", "gap")
@@ -31,6 +33,8 @@ EVERYWHERE = (-np.inf, np.inf)
 DRAW_GAPS = ("expected_gap", "foresight_gap")
 LIMITS = {"service": SHARE, "gap": (0.0, np.inf)}
 """Within which figures lie: the bound is proved, so that no gap is below 0."""
+TUNING_SHARE = 0.5
+"""Share of setting margins in the work of a comparison that does so."""
 SOLVER_SHARE = 0.7
 """Share of solving programs in the work on bounds; the rest is to evaluate their multipliers for every episode."""
 ProgressReport = Callable[[str, float], None]
@@ -55,6 +59,7 @@ class Entry:
     uncertain_bound: Annotated[
         UncertainBound | None, "the bound for who does not foresee, on draws that are the episodes"
     ] = None
+    calibration: Annotated[Calibration | None, "the margin on what it aims at, if it was tuned"] = None
 
     @property
     def circularity(self) -> Floats:
@@ -65,6 +70,11 @@ class Entry:
     def service(self) -> Floats:
         """Mean of the services' levels in each episode, shape (episodes,)."""
         return self.rollout.episode_service
+
+    @property
+    def milliseconds(self) -> float:
+        """Processor time of a decision in one copy, what was planned before the episode included, ms."""
+        return 1e3 * self.rollout.control_seconds / self.rollout.circularity.size
 
     @property
     def gap(self) -> Floats | None:
@@ -127,7 +137,8 @@ class Comparison:
     """What every policy and controller did in the same episodes; episode i starts from seed ``first_seed + i``.
 
     The network is under its scenario and horizon, and ``baseline`` has the bounds that the entries are held against.
-    ``ties`` names the pairs that the episodes do not tell apart, if their number was left to what they say.
+    ``ties`` names the pairs that the episodes do not tell apart, if their number was left to what they say, and
+    ``demand`` is the mean level demanded of each service, if one is.
     """
 
     network: Network
@@ -136,11 +147,30 @@ class Comparison:
     entries: tuple[Entry, ...]
     baseline: Baseline
     ties: tuple[str, ...] | None = None
+    demand: Floats | None = None
 
     @property
     def episodes(self) -> int:
         """Episodes of each entry."""
         return len(self.entries[0].circularity)
+
+    @property
+    def figures(self) -> tuple[str, ...]:
+        """What tables have of each row: FIGURES, with a bound for who does not foresee its gaps in place of others."""
+        return FIGURES if self.entries[0].uncertain_bound is None else (*FIGURES[:3], *DRAW_GAPS)
+
+    def misses(self) -> dict[str, float]:
+        """Return the rows whose margin was set and that do not deliver what is demanded, within ``calibration.CLOSE``.
+
+        With the least of the expected levels less what is demanded.
+        """
+        if self.demand is None:
+            return {}
+        tuned_rows = [row for row in self.rows if row.entries[0].calibration is not None]
+        excess = {
+            row.name: min(f.value - d for f, d in zip(row.levels(), self.demand, strict=True)) for row in tuned_rows
+        }
+        return {name: value for name, value in excess.items() if abs(value) > CLOSE}
 
     @property
     def rows(self) -> tuple[Row, ...]:
@@ -163,6 +193,8 @@ def compare(
     bounds: bool = True,
     uncertain: bool | None = None,
     uncertain_bound: UncertainBound | None = None,
+    tune: int | None = None,
+    futures: int | None = None,
     progress: ProgressReport = lambda stage, share: None,
 ) -> Comparison:
     """Let trained policies and controllers act in the same fresh episodes.
@@ -178,13 +210,16 @@ def compare(
         episodes: at least 2; None: 64, or of a network that is disturbed 256, and twice and four times as many while
             the interval of a difference between two rows is wider than that (``episode_count.ties``).
         seed: different seeds share no episode.
-        min_service: mean level of every service, or of each, shape (services,), that ``mpc`` and ``optimum`` plan for;
+        min_service: mean level of every service, or of each, shape (services,), that ``registry.PLANNERS`` plan for;
             None: as much as can be had.
         bounds: whether to hold the episodes against the best possible.
         uncertain: whether each episode draws the uncertain numbers of the network, the same for everyone; each is then
             held against the best possible with the numbers that it drew. None: if it was so in the training.
         uncertain_bound: ``bound(…, uncertain=True)`` of the same network, to which entries have a gap as well: its
-            draws are the episodes, whose number and seed it sets.
+            draws are the episodes, whose number and seed it sets. ``price_policy`` acts by its prices.
+        tune: draws of its own on which each controller that has a margin on what it aims at sets that so that the
+            expected level of the service that lacks most is ``min_service``; None: the margin is 1.
+        futures: that ``scenario_mpc`` plans for; None: ``registry.FUTURES``.
         progress: called with what is being done and the share of all that is done.
 
     Raises:
@@ -201,13 +236,25 @@ def compare(
     run_directories = [run if isinstance(run, RunDirectory) else RunDirectory(run) for run in runs]
     controls = controllers if "neutral" in controllers else ["neutral", *controllers]
     variant = None if definition is None else definition.scenario(scenario)
-    candidates, env = contenders(run_directories, controls, variant, min_service, uncertain)
+    prices = None if uncertain_bound is None else uncertain_bound.prices
+    candidates, env = contenders(
+        run_directories, controls, variant, min_service, uncertain, futures=futures, prices=prices
+    )
+    demand = None if min_service is None else demanded_levels(env.network, min_service)
+    if tune is not None and demand is None:
+        raise CirlError("tune: give min_service, to which expected levels are tuned")
     if uncertain_bound is not None:
         episodes, seed = _check_draws(uncertain_bound, env, episodes, seed), uncertain_bound.sampling.seed
     adapts, first = episodes is None and bool(env.network.disturbed), first_seed(seed)
     episodes = enough_episodes(env.network) if episodes is None else episodes
+    calibrations: list[Calibration | None] = [None] * len(candidates)
+    if tune is not None and demand is not None:
+        calibrations, progress = _tune(candidates, demand, tune, progress), _after(progress, TUNING_SHARE)
     share = 1 / (len(candidates) + (len({who_acts.name for who_acts in candidates}) if bounds else 0))
-    actors = [(contender, contender.controller()) for contender in candidates]
+    actors = [
+        (contender, contender.controller() if calibration is None else contender.controller(margin=calibration.margin))
+        for contender, calibration in zip(candidates, calibrations, strict=True)
+    ]
     checkpoints = [actor.checkpoint.name if isinstance(actor, Trained) else "" for _, actor in actors]
     rollouts, unclear = _play(actors, first, episodes, adapts=adapts, share=share, progress=progress)
     episodes, baseline = len(rollouts[0].circularity), Baseline()
@@ -226,13 +273,32 @@ def compare(
         except NoCertificate as missing:
             report(1.0)
             baseline = Baseline(reason=str(missing))
-    rows = [*zip(candidates, checkpoints, rollouts, bounds_by_entry, strict=True)]
-    neutral = next(run for candidate, _, run, _ in rows if candidate.run is None and candidate.name == "neutral")
+    rows = [*zip(candidates, checkpoints, rollouts, bounds_by_entry, calibrations, strict=True)]
+    neutral = next(run for candidate, _, run, *_ in rows if candidate.run is None and candidate.name == "neutral")
     entries = []
-    for candidate, checkpoint, run, bound in rows:
+    for candidate, checkpoint, run, bound, calibration in rows:
         training = candidate.name, candidate.seed, candidate.run, checkpoint
-        entries.append(Entry(*training, run, gain(run, neutral), bound, uncertain_bound))
-    return Comparison(env.network, env.agents, first, tuple(entries), baseline, unclear if adapts else None)
+        entries.append(Entry(*training, run, gain(run, neutral), bound, uncertain_bound, calibration))
+    ties_ = unclear if adapts else None
+    return Comparison(env.network, env.agents, first, tuple(entries), baseline, ties_, demand)
+
+
+def _tune(
+    candidates: Sequence[Contender], demand: Floats, draws: int, progress: ProgressReport
+) -> list[Calibration | None]:
+    """Return the margin of each that has one, set on other draws."""
+    calibrations: list[Calibration | None] = [None] * len(candidates)
+    share = TUNING_SHARE / len(candidates)
+    for place, contender in enumerate(candidates):
+        if contender.is_tunable:
+            report = part_of(progress, f"{contender.name}, margin", place * share, share)
+            calibrations[place] = calibrate(contender.env, contender.controller, demand, draws, report)
+    return calibrations
+
+
+def _after(progress: ProgressReport, done: float) -> ProgressReport:
+    """Return what takes the progress of all that follows on a share that is ``done``."""
+    return lambda stage, share: progress(stage, done + (1 - done) * share)
 
 
 def _check_draws(bound_: UncertainBound, env: MultiAgentVectorEnv, episodes: int | None, seed: int) -> int:

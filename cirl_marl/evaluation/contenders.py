@@ -14,21 +14,24 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Network
-from cirl_marl.optimum.registry import CONTROLLERS, named_controller
+from cirl_marl.optimum.draws import Prices
+from cirl_marl.optimum.registry import CONTROLLERS, PLANNERS, TUNABLE, named_controller
 
 
 @dataclass(frozen=True, slots=True)
 class Contender:
     """A policy or controller that is yet to act in its row of a comparison; ``seed`` and ``run`` are of its training.
 
-    ``controller`` makes it, and ``env`` the environment in which it acts, with so many copies.
+    ``controller`` makes it, if it ``is_tunable`` with a margin, and ``env`` the environment in which it acts, with so
+    many copies.
     """
 
     name: str
     seed: int | None
     run: RunDirectory | None
-    controller: Callable[[], Controller]
+    controller: Callable[..., Controller]
     env: Callable[[int], MultiAgentVectorEnv]
+    is_tunable: bool = False
 
 
 def contenders(
@@ -37,6 +40,9 @@ def contenders(
     network: Network | None,
     min_service: ArrayLike | None,
     uncertain: bool | None = None,
+    *,
+    futures: int | None = None,
+    prices: Prices | None = None,
 ) -> tuple[list[Contender], MultiAgentVectorEnv]:
     """Return everyone who is compared, and a copy of the environment that they share.
 
@@ -66,7 +72,10 @@ def contenders(
             return runs[0].make_env(copies, uncertain=uncertain)
         return MultiAgentVectorEnv(network, num_envs=copies, agents=first.agents, uncertain=draws)
 
-    plain = [_controller(name, common_env, min_service) for name in controllers]
+    plain = [
+        _controller(name, common_env, min_service, futures if name == "scenario_mpc" else None, prices)
+        for name in controllers
+    ]
     return [*_policies(runs, uncertain), *plain], first
 
 
@@ -144,8 +153,14 @@ def _policy(run: RunDirectory) -> Controller:
     return Trained(run)
 
 
-def _controller(name: str, env: Callable[[int], MultiAgentVectorEnv], min_service: ArrayLike | None) -> Contender:
-    service = min_service if name in ("mpc", "optimum") else None
-    controller = partial(named_controller, name, min_service=service)
+def _controller(
+    name: str,
+    env: Callable[[int], MultiAgentVectorEnv],
+    min_service: ArrayLike | None,
+    futures: int | None,
+    prices: Prices | None,
+) -> Contender:
+    service = min_service if name in PLANNERS else None
+    controller = partial(named_controller, name, min_service=service, futures=futures, prices=prices)
     controller()  # an unknown name fails before anything is computed
-    return Contender(name, None, None, controller, env)
+    return Contender(name, None, None, controller, env, name in TUNABLE)

@@ -54,4 +54,5 @@ def concatenation(first: Rollout, second: Rollout) -> Rollout:
     changes = {name: np.concatenate([getattr(r, name) for r in (first, second)], axis) for name, axis in along.items()}
     for name in ("shortage", "final_stock", "mean_flow"):  # means over copies
         changes[name] = share * getattr(first, name) + (1.0 - share) * getattr(second, name)
-    return replace(first, **changes)
+    seconds = first.control_seconds + second.control_seconds
+    return replace(first, control_seconds=seconds, **changes)

@@ -118,14 +118,34 @@ class DisturbanceProcesses:
         noise = np.ascontiguousarray(drawn.transpose(1, 2, 0))
         states = np.empty_like(noise)
         if len(self._rows):
-            latent = self._start + self._start_mix(noise[0, self._rows])
-            states[0, self._rows] = latent
+            states[0, self._rows] = self._start + self._start_mix(noise[0, self._rows])
+        for n, process in self._others:
+            states[0, n] = process.first(noise[0, n])
+        return self._go_on_from(states, noise, 0)
+
+    def continuations(self, states: Floats, step: int, noise: Floats) -> Paths:
+        """Return what may follow on some states, the first of the paths.
+
+        Args:
+            states: of the processes in interval ``step``, shape (names, B).
+            step: the interval.
+            noise: independent standard normal numbers of the intervals after it, shape (ahead, names, B).
+        """
+        paths, noise = np.empty((len(noise) + 1, *states.shape)), np.concatenate([np.zeros_like(states)[None], noise])
+        paths[0] = states
+        return self._go_on_from(paths, noise, step)
+
+    def _go_on_from(self, states: Floats, noise: Floats, step: int) -> Paths:
+        """Fill in the states after the first, shape (steps, names, B), which follow from the ``noise`` of each."""
+        steps = len(states)
+        if len(self._rows):
+            latent = states[0, self._rows]
             for t in range(1, steps):
                 latent = self._memory * latent + self._innovation * self._mix(noise[t, self._rows])
                 states[t, self._rows] = latent
         for n, process in self._others:
             process.follow(noise[:, n], states[:, n])
-        return Paths(states, self._values(states, self._offset_table(steps)))
+        return Paths(states, self._values(states, self._offset_table(step + steps)[step:]))
 
     def values(self, states: Floats, step: int) -> Floats:
         """Return ξ of an interval whose states are these, shape (names, B)."""
@@ -210,16 +230,19 @@ class _Chain:
         # a normal draw leads past so many of the others as its quantile is beyond their probabilities together
         self._bounds, self._first_bounds = (_normal_bounds(table) for table in (self._matrix, self.first_shares))
 
+    def first(self, noise: Floats) -> Floats:
+        """Return the regimes in which standard normal draws begin, shape (B,)."""
+        return np.asarray((noise >= self._first_bounds[:, None]).sum(axis=0), dtype=float)
+
     def follow(self, noise: Floats, states: Floats) -> None:
-        """Write the regimes that standard normal draws give, shape (steps, B) both."""
+        """Write the regimes after the first that standard normal draws give, shape (steps, B) both."""
         steps, copies = noise.shape
         # where each regime would go, shape (steps, regimes, B)
         ways = np.zeros((steps, len(self.values), copies), dtype=np.intp)
         for i, bounds in enumerate(self._bounds):
             for bound in bounds:
                 ways[:, i] += noise >= bound
-        regime = (noise[0] >= self._first_bounds[:, None]).sum(axis=0)
-        states[0], column = regime, np.arange(copies)
+        regime, column = states[0].astype(np.intp), np.arange(copies)
         for t in range(1, steps):
             regime = ways[t].take(regime * copies + column)
             states[t] = regime
@@ -239,12 +262,16 @@ class _Record:
         self.values, self._leave = np.array(record.values), 1.0 / record.block
         self.first_shares = np.full(len(self.values), 1.0 / len(self.values))
 
+    def first(self, noise: Floats) -> Floats:
+        """Return the places at which standard normal draws begin, shape (B,)."""
+        size = len(self.values)
+        return np.asarray(np.minimum(np.floor(special.ndtr(noise) * size), size - 1))
+
     def follow(self, noise: Floats, states: Floats) -> None:
-        """Write the places that standard normal draws give, shape (steps, B) both."""
+        """Write the places after the first that standard normal draws give, shape (steps, B) both."""
         size, chance = len(self.values), special.ndtr(noise)
         # below 1/block a draw begins a block, and says where
         begins, scaled = chance < self._leave, chance * (size / self._leave)
-        states[0] = np.minimum(np.floor(chance[0] * size), size - 1)
         for t in range(1, len(chance)):
             place = np.minimum(np.floor(scaled[t]), size - 1)
             states[t] = np.where(begins[t], place, (states[t - 1] + 1) % size)

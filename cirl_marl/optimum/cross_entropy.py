@@ -161,47 +161,25 @@ def search_each(
     network = expected_network(network)
     demand = np.zeros(0) if min_service is None else demanded_levels(network, min_service)
     starts = np.asarray(initial, dtype=float)
-    copies = Population(network, agents, starts, population)
-    options = standard_candidates(copies.agents) if candidates is None else dict(candidates)
+    env = MultiAgentVectorEnv(network, num_envs=1, agents=agents)
+    options = standard_candidates(env.agents) if candidates is None else dict(candidates)
     if not options:
         raise CirlError("candidates: give at least one controller to begin with")
-    evaluations = len(options) + population * iterations
-    highest = np.full(len(starts), -np.inf)
-    episodes_done = 0
-
-    def objective(episodes: Episodes) -> Floats:
-        value: Floats = episodes.circularity / network.objective.circularity_scale
-        if service_weight is not None:
-            value = value + service_weight * episodes.service
-        if min_service is not None:
-            lack = np.maximum(0.0, demand[:, None, None] - episodes.levels)
-            value = value - SHORTFALL_PRICE * lack.sum(axis=0)
-        return value
-
-    def report(episodes: int) -> Callable[[float], None]:
-        return lambda share: progress((episodes_done + episodes * share) / evaluations, highest)
-
-    controllers = list(options.values())
-    entrants = np.tile(np.arange(len(options)), (len(starts), 1))
-    first = Population(network, copies.agents, starts, len(options)).run(
-        controllers, entrants, np.zeros((*entrants.shape, 1, copies.entries)), report(len(options))
+    first, best, origin = explore(
+        lambda size: Population(network, agents, starts, size),
+        [*options.values()],
+        lambda episodes: objective_of(network, episodes, service_weight, demand),
+        knots=knots,
+        population=population,
+        iterations=iterations,
+        seed=seed,
+        progress=progress,
     )
-    best = _Best.among(first, objective(first))
-    origin = best.copy
-    gaussians = Gaussians(best.objective, population, copies.entries, seed)
-    episodes_done, highest = len(options), best.objective
-    for count in knot_counts(knots, iterations):
-        gaussians.refine(count)
-        controller = np.repeat(origin[:, None], population, axis=1)
-        trial = copies.run(controllers, controller, gaussians.draw(), report(population))
-        gaussians.learn(objective(trial), trial.deviation)
-        best = best.or_better(_Best.among(trial, objective(trial)))
-        episodes_done, highest = episodes_done + population, best.objective
-    progress(1.0, best.objective)
+    evaluations = len(options) + population * iterations
     return [
         Incumbent(
             network=network,
-            agents=copies.agents,
+            agents=env.agents,
             initial=starts[i].copy(),
             actions=best.actions[i],
             circularity=float(best.circularity[i]),
@@ -217,6 +195,79 @@ def search_each(
     ]
 
 
+def objective_of(
+    network: Network,
+    episodes: Episodes,
+    service_weight: float | None,
+    demand: Floats,
+    price: float = SHORTFALL_PRICE,
+) -> Floats:
+    """Return the objective of episodes, shape (starts, copies); see ``search``.
+
+    ``demand`` is the level demanded of each service, shape (services,), or empty, and ``price`` that of what lacks.
+    """
+    value: Floats = episodes.circularity / network.objective.circularity_scale
+    if service_weight is not None:
+        value = value + service_weight * episodes.service
+    if len(demand):
+        lack = np.maximum(0.0, demand[:, None, None] - episodes.levels)
+        value = value - price * lack.sum(axis=0)
+    return value
+
+
+def explore(
+    populate: Callable[[int], Population],
+    controllers: Sequence[Controller],
+    objective: Callable[[Episodes], Floats],
+    *,
+    knots: int,
+    population: int,
+    iterations: int,
+    seed: int,
+    progress: SearchReport = lambda share, objective: None,
+) -> tuple[Episodes, Best, Integers]:
+    """Look for the best deviations from the actions of some controllers, with the cross-entropy method.
+
+    Args:
+        populate: makes so many copies of every start.
+        controllers: to begin with.
+        objective: of episodes, shape (starts, copies).
+        knots: see ``search``.
+        population: likewise.
+        iterations: likewise.
+        seed: likewise.
+        progress: likewise.
+
+    Returns:
+        The episodes of the controllers, the best of all from each start, and with which of the controllers it began,
+        shape (starts,).
+    """
+    evaluations = len(controllers) + population * iterations
+    copies, entrants = populate(population), populate(len(controllers))
+    starts = entrants.starts
+    highest, episodes_done = np.full(starts, -np.inf), 0
+
+    def report(episodes: int) -> Callable[[float], None]:
+        return lambda share: progress((episodes_done + episodes * share) / evaluations, highest)
+
+    choices = np.tile(np.arange(len(controllers)), (starts, 1))
+    nothing = np.zeros((*choices.shape, 1, copies.entries))
+    first = entrants.run(controllers, choices, nothing, report(len(controllers)))
+    best = Best.among(first, objective(first))
+    origin = best.copy
+    gaussians = Gaussians(best.objective, population, copies.entries, seed)
+    episodes_done, highest = len(controllers), best.objective
+    for count in knot_counts(knots, iterations):
+        gaussians.refine(count)
+        choices = np.repeat(origin[:, None], population, axis=1)
+        trial = copies.run(controllers, choices, gaussians.draw(), report(population))
+        gaussians.learn(objective(trial), trial.deviation)
+        best = best.or_better(Best.among(trial, objective(trial)))
+        episodes_done, highest = episodes_done + population, best.objective
+    progress(1.0, best.objective)
+    return first, best, origin
+
+
 def standard_candidates(agents: Sequence[str]) -> dict[str, Controller]:
     """Return neutral control, scripts (neutral for agents without one), and all agents at either end of their range."""
     ends = {"lowest": -1.0, "highest": 1.0}
@@ -224,7 +275,7 @@ def standard_candidates(agents: Sequence[str]) -> dict[str, Controller]:
     return {"neutral": Neutral(), "scripted": ScriptController(), **constants}
 
 
-class _Best(NamedTuple):
+class Best(NamedTuple):
     """The best episode from each start: which of the copies it was, and what it was like, shape (starts, …)."""
 
     copy: Integers
@@ -235,18 +286,18 @@ class _Best(NamedTuple):
     actions: Floats
 
     @classmethod
-    def among(cls, episodes: Episodes, objective: Floats) -> _Best:
+    def among(cls, episodes: Episodes, objective: Floats) -> Best:
         """Return the first of the best ``episodes``, of ``objective`` (starts, copies)."""
         copy, start = objective.argmax(axis=1), np.arange(len(objective))
         actions = np.stack([episodes.actions[:, :, i, c] for i, c in zip(start, copy, strict=True)])
         figures = episodes.circularity[start, copy], episodes.service[start, copy], episodes.levels[:, start, copy].T
         return cls(copy, objective[start, copy], *figures, actions)
 
-    def or_better(self, rival: _Best) -> _Best:
+    def or_better(self, rival: Best) -> Best:
         """Return the better of the two from each start, these if they are equal."""
         better = rival.objective > self.objective
         pairs = zip(rival, self, strict=True)
-        return _Best(*(np.where(better.reshape(-1, *[1] * (pair[0].ndim - 1)), *pair) for pair in pairs))
+        return Best(*(np.where(better.reshape(-1, *[1] * (pair[0].ndim - 1)), *pair) for pair in pairs))
 
 
 class Gaussians:

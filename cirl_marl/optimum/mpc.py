@@ -10,6 +10,10 @@ objective, c' = c − Aᵀy, which leaves a price on each stock at the window's 
 this is an upper bound on what those are worth to the rest of the episode, exact along its plan, so that nothing is run
 down because the window ends. Prices that are linear leave many plans equal; of these the one that ends nearest to the
 plan of the episode is taken. With ``horizon=None`` the window shrinks with what is left of the episode.
+
+Where nobody foresees what disturbs the network, a plan is for the conditional means of the disturbances given their
+present states (certainty equivalence), or for several futures drawn from there, whose first interval is the same
+(scenario MPC). Prices are then those of one episode in which all is as expected from the start.
 """
 
 from __future__ import annotations
@@ -26,20 +30,32 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, ControlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
-from cirl_marl.network.uncertainty import expected_network
+from cirl_marl.network.innovations import innovations
+from cirl_marl.network.uncertainty import draw_network, expected_network
 from cirl_marl.optimum.admissible import Admissible, NoCertificate
 from cirl_marl.optimum.bounds import Bound, bound
 from cirl_marl.optimum.cross_entropy import KNOTS, Incumbent, search_each
+from cirl_marl.optimum.draws import Prices
 from cirl_marl.optimum.improve import improve_plan
-from cirl_marl.optimum.options import check_options, demanded_levels
+from cirl_marl.optimum.options import check_margin, check_options, demanded_levels, starting_stocks, with_margin
 from cirl_marl.optimum.planned_episodes import Plan, starting_states
 from cirl_marl.optimum.smooth import MOST_ROWS, program_rows, smooth_plan
-from cirl_marl.optimum.solver import SolverFailure
-from cirl_marl.optimum.window_planner import WindowPlanner
+from cirl_marl.optimum.solver import Infeasible, SolverFailure
+from cirl_marl.optimum.window_planner import Future, WindowPlanner
 from cirl_marl.optimum.windows import Continuation, WindowPlan, WindowTask
 
 SERVICE_FIRST = 1000.0
 """Weight of the mean service level, against λ̄/circularity_scale, at which service comes first."""
+LEAST_PRICE = 0.1
+"""Least that is charged for a unit of service that lacks in a disturbed network, in λ̄/circularity_scale."""
+WINDOW = 10
+"""Decisions that a plan looks ahead where the network is disturbed, unless another number is asked for."""
+FUTURES_SEED = 38
+"""Of the noise of futures, the same in every episode."""
+FIRST_SAMPLE, SAMPLES = 2**30, 256
+"""First seed and number of the paths over which what is expected of their functions is averaged."""
+MOST_VARIABLES = 50_000
+"""Variables of the largest program of several futures."""
 BOUND = 0.3
 """About the share of solving for the bound in the work on a plan; the rest is to improve it."""
 
@@ -62,6 +78,9 @@ class MPC(Planner):
     intervals lacked the planned ones have to make up for. What is out of reach is asked for as far as it can be had; no
     service counts beyond its demand. A service that arcs make up for while nobody acts on them is planned in full, as
     they will supply it.
+
+    In a disturbed network ``min_service`` is of the *expected* levels: what lacks in any interval is charged for at the
+    multipliers of the plan for what is expected, or those of the ``prices``, whatever was delivered before.
     """
 
     ahead = 0.1  # a first plan takes longer than the later ones, which start from it
@@ -73,28 +92,47 @@ class MPC(Planner):
         min_service: ArrayLike | None = None,
         service_weight: float | None = None,
         degree: int = 1,
-        replan: int = 4,
+        replan: int | None = None,
+        futures: int | None = None,
+        margin: float = 1.0,
+        prices: Prices | None = None,
     ) -> None:
         """Choose what is planned.
 
         Args:
-            horizon: decisions that a plan looks ahead; None looks to the end of the episode.
+            horizon: decisions that a plan looks ahead; None looks to the end of the episode, in a disturbed network
+                WINDOW ahead.
             min_service: mean level demanded, in [0, 1], of every service, or of each, shape (services,); excludes
                 ``service_weight``.
             service_weight: w ≥ 0.
             degree: degree of the test polynomials; see ``bound``.
-            replan: decisions carried out of each plan.
+            replan: decisions carried out of each plan; None: 4, in a disturbed network 1.
+            futures: how many are drawn at every decision in a disturbed network; None: one, in which all is as it is
+                expected to be.
+            margin: by what the demanded bands of services are multiplied in plans, or in a disturbed network what is
+                charged for service that lacks.
+            prices: of a bound for who does not foresee (``bound(…, uncertain=True)``): a plan then looks a single
+                interval ahead, and what stocks are worth after it follows the states of the disturbances.
 
         Raises:
             CirlError: for an option that cannot be used.
         """
         check_options(service_weight, min_service, degree)
-        for name, value in (("replan", replan), ("horizon", replan if horizon is None else horizon)):
+        check_margin(margin)
+        if futures is not None and replan not in (None, 1):
+            raise CirlError(f"replan {replan}: of a plan for several futures only the first decision is carried out")
+        if prices is not None and (horizon, futures) != (None, None):
+            raise CirlError("prices are for plans of a single interval; leave out horizon and futures")
+        for name, value in (("replan", replan), ("horizon", horizon), ("futures", futures)):
+            if value is None:
+                continue
             if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
                 raise CirlError(f"{name} must be a whole number of at least 1, got {value!r}")
-        if horizon is not None and horizon < replan:
+        if horizon is not None and horizon < (replan or 1):
             raise CirlError(f"horizon {horizon} is shorter than the {replan} decisions carried out of each plan")
-        self._horizon, self._replan = horizon, replan
+        self._options = horizon, replan, futures
+        self._prices = prices
+        self._margin = margin
         self._min_service, self._weight, self._degree = min_service, service_weight, degree
 
     def plan(self, env: MultiAgentVectorEnv, seed: int, progress: Callable[[float], None]) -> None:
@@ -104,15 +142,31 @@ class MPC(Planner):
             NoCertificate: for a network whose flows are not linear laws; see ``bound``.
             CirlError: for another number of demanded levels than services.
         """
-        network = env.network
+        network, (horizon, replan, futures) = env.network, self._options
         self._levels = None if self._min_service is None else demanded_levels(network, self._min_service)
-        self.note = ""
-        self._env = env
-        admissible = Admissible.of(expected_network(network), env.agents or None)
-        self._planner = WindowPlanner(admissible, self._degree, self._weight)
+        self.note, self._env, is_disturbed = "", env, bool(network.disturbed)
+        self._horizon = (WINDOW if self._prices is None else 1) if horizon is None and is_disturbed else horizon
+        self._replan = (1 if is_disturbed else 4) if replan is None else replan
+        self._futures = futures if is_disturbed else None
+        self._prior = network.processes.prior_means(network.episode.horizon)
+        if self._prices is not None:
+            paths = network.processes.sample(range(FIRST_SAMPLE, FIRST_SAMPLE + SAMPLES)).states
+            self._mean_features = innovations(network.processes, paths[:-1]).features.mean(axis=2)
+        self._planner = WindowPlanner([self._future(self._prior)], self._weight)
         supplies = {arc.makes_up_for for arc in network.arcs if arc.makes_up_for and arc.id not in env.agents}
         self._full = np.array([service.id in supplies for service in network.services], dtype=bool)
         self._outlooks: dict[int, WindowPlan] = {}
+        self._common_outlook: WindowPlan | None = None
+        self._price = np.zeros(0)
+        is_short = self._horizon is not None and self._horizon < network.episode.horizon
+        if is_disturbed and (is_short or self._levels is not None):
+            self._common_outlook = outlook = self._expected_outlook()
+            multipliers = -outlook.solution.certificate.under[len(outlook.problem.under_to) - len(network.services) :]
+            if self._prices is not None:
+                multipliers = self._prices.service
+            if self._levels is not None:
+                least = LEAST_PRICE * network.objective.circularity_scale
+                self._price = self._margin * np.maximum(multipliers, least)
         self._plans = []
         for copy in range(env.num_envs):
             self._plans.append(self._next(copy, None))
@@ -146,7 +200,7 @@ class MPC(Planner):
         earlier = None if last is None else last.window
         try:
             planned = self._solve_window(copy, rest, window, earlier)
-        except SolverFailure as failure:
+        except (Infeasible, SolverFailure) as failure:
             self.note = f"MPC goes on as it planned before, or neutrally, where a plan is missing: {failure}"
             return self._older(copy, step, earlier)
         return _Plan(int(self._env.episodes[copy]), step, planned.actions[: self._replan], planned)
@@ -155,17 +209,37 @@ class MPC(Planner):
         """Plan the ``window`` of what is left of the episode, the ``rest``."""
         state, steps = self._env.physical, self._env.network.episode.horizon
         deficit = None if self._levels is None else self._levels * steps - state.service[:, copy]
+        if deficit is not None and len(self._price):  # no level is demanded, all that lacks has its price
+            deficit = np.full(len(deficit), float(len(rest)))
         if last is None:
             self._outlooks.pop(copy, None)
         if len(window) == len(rest):
             return self._plan(copy, window, deficit, last)
-        if copy not in self._outlooks:
+        if self._common_outlook is None and copy not in self._outlooks:
             self._outlooks[copy] = self._plan(copy, rest, deficit, None, is_outlook=True)
-        outlook = self._outlooks[copy]
+        outlook = self._common_outlook or self._outlooks[copy]
         after = window.stop - outlook.task.intervals.start
         if deficit is not None:
-            deficit = deficit - outlook.levels[after:].sum(axis=0)
-        return self._plan(copy, window, deficit, last or outlook, outlook.continuation(window))
+            deficit = deficit - (steps - window.stop if len(self._price) else outlook.levels[after:].sum(axis=0))
+        later = outlook.continuation(window)
+        if self._prices is not None:
+            later = replace(later, costs=self._state_costs(later.costs, copy, window))
+        return self._plan(copy, window, deficit, last or outlook, later)
+
+    def _state_costs(self, costs: Floats, copy: int, window: range) -> Floats:
+        """Return the costs of what comes after a window, with prices that follow the states of the disturbances.
+
+        What a stock is worth then, beside what it is on average, is E[Σ_f θ_f φ_f(s_{t+1}) | s_t], less its mean.
+        """
+        assert self._prices is not None
+        processes, step = self._env.network.processes, window.stop - 1
+        state = self._env.physical.processes[step, :, [copy]].T
+        now = innovations(processes, np.stack([state, state]))
+        table = np.zeros((len(self._mean_features) - 1, now.features.shape[1]))
+        table[step] = (now.features[1] - now.new[0])[:, 0] - self._mean_features[step + 1]
+        (future,), costs = self._planner.futures, costs.copy()
+        costs[-1, future.layout.last] -= self._prices.weights(table)[step] @ future.admissible.lifetimes.totals
+        return costs
 
     def _older(self, copy: int, step: int, last: WindowPlan | None) -> _Plan:
         """Return the last plan, to be carried out for longer, or one to be neutral where it has come to its end."""
@@ -198,13 +272,95 @@ class MPC(Planner):
             is_outlook: whether the multipliers must be good, as they are the prices of later plans.
         """
         stock = self._env.physical.stock[self._env.rows.nodes, copy]
+        planner = self._planner if is_outlook else self._planner_at(copy, intervals)
+        return self._solve_task(planner, stock, intervals, deficit, last, later, is_outlook=is_outlook)
+
+    def _solve_task(
+        self,
+        planner: WindowPlanner,
+        stock: Floats,
+        intervals: range,
+        deficit: Floats | None,
+        last: WindowPlan | None,
+        later: Continuation | None = None,
+        *,
+        is_outlook: bool = False,
+    ) -> WindowPlan:
+        """Plan some intervals from a ``stock``, by stage; see ``_plan``."""
         demand = None
         if deficit is not None:  # no interval delivers more than all that is wanted
             demand = np.where(self._full, 1.0, np.clip(deficit / len(intervals), 0.0, 1.0))
-        correction = None if last is None else last.corrections(intervals)
-        price = self._planner.first_price if last is None else last.task.price
-        task = WindowTask(stock, intervals, demand, later, price, correction, is_outlook)
-        return self._planner.plan(task, last.basis(intervals) if last else None, self._replan)
+        corrections = None if last is None else last.corrections_of(intervals, len(planner.futures))
+        price = planner.first_price if last is None else last.task.price
+        if len(self._price) and not is_outlook:
+            price = self._price
+        is_redrawn = bool(self._env.network.disturbed)
+        task = WindowTask(stock, intervals, demand, later, price, corrections, is_outlook, is_redrawn)
+        return planner.plan(task, last.basis(intervals) if last else None, self._replan)
+
+    def _planner_at(self, copy: int, intervals: range) -> WindowPlanner:
+        """Return what plans some intervals of a copy, from the first of which on nobody knows the disturbances.
+
+        Raises:
+            CirlError: for a program of several futures that is too large.
+        """
+        network, step = self._env.network, intervals.start
+        if not network.disturbed:
+            return self._planner
+        states, processes, ahead = self._env.physical.processes[step, :, [copy]].T, network.processes, len(intervals)
+        paths = processes.values(states, step)[None]
+        if self._futures is None:
+            paths = np.concatenate([paths, processes.conditional_means(states, step, ahead - 1)])
+        else:
+            noise = future_noise(step, ahead - 1, len(states), self._futures)
+            paths = processes.continuations(np.repeat(states, self._futures, axis=1), step, noise).values
+        futures = []
+        for values in np.moveaxis(paths, 2, 0):
+            path = self._prior.copy()
+            path[step : intervals.stop] = values
+            futures.append(self._future(path, intervals))
+            if not futures[1:]:
+                self._check_size(futures[0], ahead)
+        return WindowPlanner(futures, self._weight)
+
+    def _check_size(self, future: Future, intervals: int) -> None:
+        size = (self._futures or 1) * intervals * future.layout.size
+        if self._futures is not None and size > MOST_VARIABLES:
+            name, shape = self._env.network.name, f"{self._futures} futures of {intervals} intervals"
+            raise CirlError(
+                f"network '{name}': the program of {shape} has {size:,} variables, more than {MOST_VARIABLES:,}; take "
+                "fewer futures or a shorter horizon"
+            )
+
+    def _future(self, path: Floats, intervals: range | None = None) -> Future:
+        """Return the network in which disturbances follow a path, shape (horizon, names), as plans have it."""
+        env, network = self._env, self._env.network
+        if network.disturbed:
+            network = draw_network(network, (), path)
+            if env.dynamics.substeps > 1:
+                network = network.with_options(episode={"solver_step": env.dynamics.substep})
+        elif self._levels is not None:
+            network = with_margin(network, self._margin)
+        admissible = Admissible.of(network, env.agents or None)
+        return Future(admissible, self._degree, self._weight, intervals)
+
+    def _expected_outlook(self) -> WindowPlan:
+        """Return the plan of an episode in which all is as expected, from the middle of the initial ranges."""
+        (future,), steps = self._planner.futures, range(self._env.network.episode.horizon)
+        deficit = None if self._levels is None else self._levels * len(steps)
+        stock = starting_stocks(future.admissible.lifetimes, None)
+        return self._solve_task(self._planner, stock, steps, deficit, None, is_outlook=True)
+
+
+def future_noise(step: int, intervals: int, names: int, futures: int) -> Floats:
+    """Return standard normal numbers for futures drawn in interval ``step``, shape (intervals, names, futures).
+
+    The same in every episode, so that what is done follows from the state alone. Every second future has those of the
+    one before with the other sign (antithetic variates).
+    """
+    half = np.random.default_rng([FUTURES_SEED, step]).standard_normal((intervals, names, (futures + 1) // 2))
+    pairs = np.stack([half, -half], axis=3)
+    return pairs.reshape(intervals, names, 2 * half.shape[2])[:, :, :futures]
 
 
 class Optimum(Planner):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,6 +13,7 @@ from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.initial_ages import age_shares
+from cirl_marl.network.series import Series, Value
 from cirl_marl.optimum.vintages import Lifetimes
 
 DEGREE = 2
@@ -112,3 +114,27 @@ def levels_text(network: Network, levels: Floats) -> str:
     if len(set(levels.tolist())) == 1:
         return f"{levels[0]:g}"
     return ", ".join(f"{level:g} of '{service.id}'" for level, service in zip(levels, network.services, strict=True))
+
+
+def check_margin(margin: float) -> None:
+    """Refuse a margin that is not positive and finite.
+
+    Raises:
+        CirlError: naming it.
+    """
+    if not 0 < margin < math.inf:
+        raise CirlError(f"margin {margin!r} must be positive and finite")
+
+
+def with_margin(network: Network, margin: float) -> Network:
+    """Return a certain network whose services want ``margin`` times as much."""
+    if margin == 1.0:
+        return network
+    services = (replace(s, low=_times(s.low, margin), high=_times(s.high, margin)) for s in network.services)
+    return replace(network, services=tuple(services))
+
+
+def _times(value: Value, factor: float) -> Value:
+    if isinstance(value, Series):
+        return replace(value, values=tuple(factor * part for part in value.values))
+    return factor * value

@@ -121,26 +121,45 @@ class Episodes:
 class Population:
     """Copies of a network, equally many from each of some starts; ``agents`` act by ``entries`` of an action."""
 
-    def __init__(self, network: Network, agents: Sequence[str] | None, starts: Floats, size: int) -> None:
+    def __init__(
+        self,
+        network: Network,
+        agents: Sequence[str] | None,
+        starts: Floats | Sequence[int],
+        size: int,
+        *,
+        uncertain: bool = False,
+    ) -> None:
         """Make the environment and put its copies where they start.
 
         Args:
             network: under its scenario and horizon.
             agents: who acts; None is the network's own choice.
-            starts: stocks and inner states, the first of ``MultiAgentVectorEnv.state_names``, shape (starts, rows).
+            starts: stocks and inner states, the first of ``MultiAgentVectorEnv.state_names``, shape (starts, rows); or
+                seeds of episodes, which draw them and all else.
             size: copies from each start.
+            uncertain: whether numbers of the network are drawn.
 
         Raises:
             CirlError: for starts that no episode can begin with, or if nobody acts.
         """
         self._shape = (len(starts), size)
-        self._env = env = MultiAgentVectorEnv(network, num_envs=len(starts) * size, agents=agents)
+        self._env = env = MultiAgentVectorEnv(network, num_envs=len(starts) * size, agents=agents, uncertain=uncertain)
         if not env.agents:
             raise CirlError(f"network '{network.name}': nobody acts, so there is nothing to search for")
         self.agents = env.agents
         self.entries = sum(neutral.shape[1] for neutral in env.neutral_action.values())
-        env.reset(seed=EVALUATION_SEEDS, options={"initial_state": by_state_name(env, np.repeat(starts, size, axis=0))})
+        repeated = np.repeat(starts, size, axis=0)
+        if repeated.ndim == 1:
+            env.reset(seed=repeated.tolist())
+        else:
+            env.reset(seed=EVALUATION_SEEDS, options={"initial_state": by_state_name(env, repeated)})
         self._start = env.snapshot()
+
+    @property
+    def starts(self) -> int:
+        """How many starts figures are of."""
+        return self._shape[0]
 
     def run(
         self,
@@ -187,6 +206,38 @@ class Population:
             levels.reshape(-1, *shape),
             actions.reshape(*actions.shape[:2], *shape),
             np.moveaxis(deviation_sum, 2, 0).reshape(deviation.shape),
+        )
+
+
+class DrawnPopulation(Population):
+    """Copies that meet the same draws: what each does is the same in all of them, and its figures are their means."""
+
+    @property
+    def starts(self) -> int:
+        """One: figures are means over draws."""
+        return 1
+
+    def run(
+        self,
+        controllers: Sequence[Controller],
+        choices: Integers,
+        deviation: Floats,
+        progress: Callable[[float], None] = lambda share: None,
+    ) -> Episodes:
+        """Run an episode of every draw in every copy; see ``Population.run``, with a single start.
+
+        Controllers must act alike in all draws.
+        """
+        draws = self._shape[0]
+        episodes = super().run(
+            controllers, np.repeat(choices, draws, axis=0), np.repeat(deviation, draws, axis=0), progress
+        )
+        return Episodes(
+            episodes.circularity.mean(axis=0, keepdims=True),
+            episodes.service.mean(axis=0, keepdims=True),
+            episodes.levels.mean(axis=1, keepdims=True),
+            episodes.actions[:, :, :1],
+            episodes.deviation[:1],
         )
 
 

@@ -79,6 +79,7 @@ class Programs:
         hold_controls: bool = False,
         merge_pieces: bool | None = None,
         system: ComparisonSystem | None = None,
+        intervals: range | None = None,
     ) -> None:
         """Write down what does not depend on the start.
 
@@ -91,6 +92,7 @@ class Programs:
             merge_pieces: whether an interval has fewer pieces than the simulator has substeps; None: if the program
                 were large otherwise.
             system: of a program of the same network and agents, whatever their services demand.
+            intervals: that programs will be of; None: of all.
         """
         self.admissible, lifetimes = admissible, admissible.lifetimes
         has_lifetimes = lifetimes.plan_network is not lifetimes.reach_network
@@ -101,7 +103,9 @@ class Programs:
         self.layout = layout = _layout(admissible, system.substeps, merge_pieces, degree)
         fast_system = ComparisonSystem(admissible) if has_lifetimes and layout.has_end_flows else system
         self._equal, self._under = ChainedRows(layout), ChainedRows(layout)
-        for kind, ranges in admissible.ranges.items():
+        period = slice(None) if intervals is None else slice(intervals.start, intervals.stop)
+        for kind in np.unique(admissible.kinds[period]).tolist():
+            ranges = admissible.ranges[kind]
             equal_links, equal, under_links, under = (ProgramRows(layout) for _ in range(4))
             balances(equal_links)
             constant_schedules(ranges, equal, under)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
 
@@ -11,9 +12,20 @@ from cirl_marl.controllers.lqr import LQR
 from cirl_marl.controllers.scripted import ScriptController
 from cirl_marl.errors import CirlError, unknown_name
 
+if TYPE_CHECKING:
+    from cirl_marl.optimum.draws import Prices
+
 SETTABLE = ("constant", "scripted")
 """Controllers that take values for single agents."""
-CONTROLLERS = ("neutral", "constant", "random", "scripted", "lqr", "mpc", "optimum")
+UNCERTAIN = ("scenario_mpc", "best_constant", "best_schedule", "price_policy")
+"""Controllers for networks in which something is drawn."""
+CONTROLLERS = ("neutral", "constant", "random", "scripted", "lqr", "mpc", "optimum", *UNCERTAIN)
+PLANNERS = ("mpc", "optimum", *UNCERTAIN)
+"""Controllers that plan for a demanded service."""
+TUNABLE = ("scripted", "mpc", *UNCERTAIN)
+"""Controllers with a margin on what they aim at."""
+FUTURES = 8
+"""That ``scenario_mpc`` plans for, unless another number is asked for."""
 
 
 def named_controller(
@@ -22,15 +34,21 @@ def named_controller(
     constants: Mapping[str, float] | None = None,
     min_service: ArrayLike | None = None,
     smooth: bool | None = False,
+    margin: float = 1.0,
+    futures: int | None = None,
+    prices: Prices | None = None,
 ) -> Controller:
     """Return a controller, not yet started.
 
     Args:
         name: one of CONTROLLERS.
         constants: agent → constant value in [−1, 1], of a constant or scripted controller.
-        min_service: mean level of every service, or of each, shape (services,), that ``mpc`` and ``optimum`` plan for;
-            None: as much as can be had.
+        min_service: mean level of every service, or of each, shape (services,), that PLANNERS plan for; None: as much
+            as can be had.
         smooth: whether the plans of ``optimum`` are to change little; see ``Optimum``.
+        margin: by what those of TUNABLE multiply what they aim at.
+        futures: that ``scenario_mpc`` plans for; None: FUTURES.
+        prices: of a bound for who does not foresee, which ``price_policy`` needs.
 
     Raises:
         CirlError: for an unknown name, or options that the controller does not take.
@@ -39,21 +57,48 @@ def named_controller(
         raise CirlError(unknown_name("control", name, CONTROLLERS))
     if constants and name not in SETTABLE:
         raise CirlError(f"values of single agents go with {' or '.join(SETTABLE)} control, not with {name}")
-    if min_service is not None and name not in ("mpc", "optimum"):
-        raise CirlError(f"a demanded service level goes with mpc or optimum control, not with {name}")
-    if name in ("mpc", "optimum"):
-        # solvers are loaded by those who ask for them
-        from cirl_marl.optimum.mpc import MPC, SERVICE_FIRST, Optimum
-
-        weight = SERVICE_FIRST if min_service is None else None
-        if name == "mpc":
-            return MPC(min_service=min_service, service_weight=weight)
-        return Optimum(min_service=min_service, service_weight=weight, smooth=smooth)
+    if min_service is not None and name not in PLANNERS:
+        raise CirlError(f"a demanded service level goes with {', '.join(PLANNERS)} control, not with {name}")
+    if margin != 1.0 and name not in TUNABLE:
+        raise CirlError(f"a margin goes with {', '.join(TUNABLE)} control, not with {name}")
+    if futures is not None and name != "scenario_mpc":
+        raise CirlError(f"futures go with scenario_mpc control, not with {name}")
+    if name in PLANNERS:
+        return _planner(name, min_service, smooth, margin, futures, prices)
     makers: Mapping[str, Callable[[], Controller]] = {
         "neutral": Neutral,
         "constant": lambda: Constant(constants),
         "random": Random,
-        "scripted": lambda: ScriptController(constants),
+        "scripted": lambda: ScriptController(constants, margin=margin),
         "lqr": LQR,
     }
     return makers[name]()
+
+
+def _planner(
+    name: str,
+    min_service: ArrayLike | None,
+    smooth: bool | None,
+    margin: float,
+    futures: int | None,
+    prices: Prices | None,
+) -> Controller:
+    """Return one of PLANNERS, whose solvers are loaded by those who ask for them."""
+    from cirl_marl.optimum.blind import BestConstant, BestSchedule
+    from cirl_marl.optimum.mpc import MPC, SERVICE_FIRST, Optimum
+
+    demand: dict[str, Any] = {
+        "min_service": min_service,
+        "service_weight": SERVICE_FIRST if min_service is None else None,
+    }
+    if name == "optimum":
+        return Optimum(smooth=smooth, **demand)
+    demand["margin"] = margin
+    if name == "price_policy":
+        if prices is None:
+            raise CirlError("price_policy control needs the prices of bound(…, uncertain=True), which compare takes")
+        return MPC(prices=prices, **demand)
+    if name == "scenario_mpc":
+        return MPC(futures=FUTURES if futures is None else futures, **demand)
+    blind = {"best_constant": BestConstant, "best_schedule": BestSchedule}
+    return blind[name](**demand) if name in blind else MPC(**demand)

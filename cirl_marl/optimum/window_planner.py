@@ -11,13 +11,18 @@ one is carried out which does best in the simulator.
 
 The price of what services lack rises until no more of them can be had.
 
+Of what nobody foresees several futures may be planned for at once: each has its own rows, what is done in the first
+interval is the same in all, and services count by their mean.
+
 Reference: Marchetti, Chachuat and Bonvin 2009, Industrial & Engineering Chemistry Research 48, 6022 (the model's error
 is added to its constraints).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Annotated
 
 import numpy as np
 from scipy import sparse
@@ -26,6 +31,7 @@ from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.dynamics.supply import Supply
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.network import Floats, Network
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
 from cirl_marl.optimum.constraints import held_controls
 from cirl_marl.optimum.matrices import ProgramRows
@@ -35,12 +41,12 @@ from cirl_marl.optimum.windows import (
     DISTANCE,
     Continuation,
     Correction,
+    JointProgram,
     WindowPlan,
     WindowTask,
     level_columns,
     level_rows,
     with_distance,
-    with_lack,
 )
 
 FIRST_PRICE, RISE, RISES = 3.0, 10.0, 8
@@ -103,25 +109,149 @@ def service_measures(network: Network, dynamics: Dynamics) -> Floats:
     return measure
 
 
-class WindowPlanner:
-    """Plans windows of a network, the better ones of which are found by trying them.
+@positional_record
+class WindowTrial:
+    """What became of the plan of a window in one future."""
+
+    actions: Annotated[Floats, "normalised, shape (intervals, entries)"]
+    value: Annotated[float, "objective reached, less what is left to later intervals"]
+    level: Annotated[Floats, "mean level of each service, shape (services,)"]
+    correction: Annotated[Correction, "what the plan promised and did not keep"]
+    promised: Annotated[Floats, "levels of the program, shape (intervals, services)"]
+
+
+class Future:
+    """One course that a network may take: its programs and its simulator.
 
     Attributes:
         admissible: what agents can do.
-        first_price: of a unit of each service that an episode lacks, in the objective, shape (services,).
+        network: the network, certain.
+        layout: of the variables of an interval.
     """
 
-    def __init__(self, admissible: Admissible, degree: int, service_weight: float | None) -> None:
+    def __init__(
+        self, admissible: Admissible, degree: int, service_weight: float | None, intervals: range | None = None
+    ) -> None:
         """Write down what does not depend on the start; see ``Programs``."""
         self.admissible = admissible
-        network = self._network = admissible.lifetimes.network
-        self._programs = Programs(admissible, degree, service_weight)
+        network = self.network = admissible.lifetimes.network
+        self._programs = Programs(admissible, degree, service_weight, intervals=intervals)
+        self.layout = self._programs.layout
         self._simulator = WindowSimulator(network, admissible.agents)
         self._measure = service_measures(network, self._simulator.dynamics)
         self._weight = service_weight
         controlled = ~admissible.by_schedule & (admissible.rate[0] < admissible.rate[1]).any(axis=0)
         controlled[admissible.lifetimes.exit_arcs] = False
         self._hold = np.flatnonzero(controlled)
+
+    def program(self, task: WindowTask, correction: Correction | None) -> Program:
+        """Return the program of a task, corrected by what became of a plan before; its demand is no part of it."""
+        admissible, period = self.admissible, slice(task.intervals.start, task.intervals.stop)
+        problem = self._programs.program(task.stock, None, task.intervals)
+        layout, steps = problem.layout, len(task.intervals)
+        cost = problem.cost.reshape(steps, -1) * (steps / self.network.episode.horizon)
+        if task.later is not None:
+            cost += task.later.costs
+        problem = replace(problem, cost=cost.ravel())
+        if correction is not None:
+            rows, error = ProgramRows(layout, steps), correction.error
+            rate, valve = correction.rate, correction.valve
+            if task.is_redrawn:  # they are of another future
+                rate = np.clip(rate, *admissible.rate[:, period])
+                valve = np.clip(valve, *admissible.valve[:, period])
+            held_controls(admissible.driver, self._hold, rate, valve, rows)
+            low, under_to, rows_of_levels = problem.low.copy(), problem.under_to.copy(), level_rows(problem)
+            under_to[rows_of_levels] -= (admissible.service_low[period] * error).ravel()
+            low[level_columns(problem)] = -np.maximum(error, 0.0).ravel()
+            matrix = rows.matrices()[0]
+            equal = sparse.vstack([problem.equal, matrix], format="csr")
+            equal_to = np.append(problem.equal_to, np.zeros(matrix.shape[0]))
+            problem = replace(problem, equal=equal, equal_to=equal_to, low=low, under_to=under_to)
+        return problem if task.later is None else with_distance(problem, task.later)
+
+    def trial(self, problem: Program, plan: Floats, task: WindowTask) -> WindowTrial:
+        """Carry a plan out in the simulator.
+
+        Args:
+            problem: the program of the future.
+            plan: its variables.
+            task: what was planned.
+        """
+        intervals, admissible, layout = task.intervals, self.admissible, problem.layout
+        variables = plan[: len(intervals) * layout.size].reshape(len(intervals), -1)
+        actions = normalised_actions(admissible, layout, variables, intervals)
+        stocks, flows = self._simulator.run(task.stock, actions, intervals.start)
+        low = admissible.service_low[intervals.start : intervals.stop]
+        quantity = np.concatenate([stocks[1:], flows], axis=1) @ self._measure.T
+        level = np.divide(quantity, low, out=np.ones_like(low), where=low > 0)
+        error = np.where(low > 0, np.clip(self._quantity(problem, plan, variables, low) - level, -1.0, 1.0), 0.0)
+        levels = np.minimum(level, 1.0)
+        return WindowTrial(
+            actions,
+            self._value(task, flows, stocks[-1], levels),
+            levels.mean(axis=0),
+            Correction(error, *self._factors(variables, intervals)),
+            variables[:, layout.level : layout.imbalance],
+        )
+
+    def _factors(self, variables: Floats, intervals: range) -> tuple[Floats, Floats]:
+        """Return the rates and valves of a plan, the neutral ones where nothing flows; see ``Correction``."""
+        admissible, layout = self.admissible, self.layout
+        period = slice(intervals.start, intervals.stop)
+        stock, flow, through = layout.means(variables)
+        rate, valve = admissible.neutral_rate[period].copy(), admissible.neutral_valve[period].copy()
+        driver = stock[:, admissible.driver]
+        np.divide(flow, driver, out=rate, where=driver > 1e-12 * np.abs(flow))
+        held = stock[:, layout.valves]
+        valve[:, layout.valves] = np.divide(
+            through, held, out=valve[:, layout.valves], where=held > 1e-12 * np.abs(through)
+        )
+        return np.clip(rate, *admissible.rate[:, period]), np.clip(valve, *admissible.valve[:, period])
+
+    def _quantity(self, problem: Program, plan: Floats, variables: Floats, low: Floats) -> Floats:
+        """Return q̂/l of a plan, shape (intervals, services)."""
+        layout = problem.layout
+        levels = variables[:, layout.level : layout.imbalance]
+        activity = (problem.under[level_rows(problem)] @ plan).reshape(low.shape)  # l·level − q̂
+        quantity: Floats = low * levels - activity
+        return np.divide(quantity, low, out=np.zeros_like(low), where=low > 0)
+
+    def _value(self, task: WindowTask, flows: Floats, end: Floats, levels: Floats) -> float:
+        """Return the objective that the simulator reaches, in parts of that of the episode."""
+        network, share = self.network, len(flows) / self.network.episode.horizon
+        weights = network.circularity_weights
+        per_interval = flows @ weights.sum(axis=0)
+        if network.objective.net_zero == "abs":
+            per_interval = flows @ weights[0] - np.abs(flows @ weights[1])
+        value = float(per_interval.mean()) * share
+        if self._weight is not None:
+            value = value / network.objective.circularity_scale
+            value += self._weight * share * float(levels.mean()) if levels.size else 0.0
+        if task.later is not None:
+            value -= self._later_cost(task.later, flows, self.admissible.lifetimes.start_planned @ end)
+        return value
+
+    def _later_cost(self, later: Continuation, flows: Floats, end: Floats) -> float:
+        """Return what an episode of the simulator leaves to later intervals, by its last stocks and its mean flows."""
+        layout, arcs = self.layout, flows.shape[1]
+        by_flow = sum(later.costs[:, first : first + arcs] for first in layout.flow.tolist())
+        price = later.costs[-1, layout.last]
+        distance = DISTANCE * np.abs(price) @ np.abs(end - later.stocks)
+        return float(price @ end + distance + np.sum(by_flow * flows))
+
+
+class WindowPlanner:
+    """Plans windows of a network, the better ones of which are found by trying them.
+
+    Attributes:
+        futures: that are planned for, with the same stocks and disturbances in the first interval of a window.
+        first_price: of a unit of each service that an episode lacks, in the objective, shape (services,).
+    """
+
+    def __init__(self, futures: Sequence[Future], service_weight: float | None) -> None:
+        """Plan for some futures of a network."""
+        self.futures, self._weight = tuple(futures), service_weight
+        network = self._network = futures[0].network
         self.first_price = np.full(len(network.services), FIRST_PRICE * network.objective.circularity_scale)
 
     def plan(self, task: WindowTask, basis: Basis | None, carried_out: int) -> WindowPlan:
@@ -135,70 +265,35 @@ class WindowPlanner:
             trial = self._trial(task, basis)
             if best is None or trial.merit > best.merit:
                 best = trial
-            if task.correction is not None:
-                error = (trial.correction.error - task.correction.error)[:carried_out].mean(axis=0)
+            if task.corrections is not None:
+                pairs = zip(trial.corrections, task.corrections, strict=True)
+                error = np.mean(
+                    [(now.error - before.error)[:carried_out].mean(axis=0) for now, before in pairs], axis=0
+                )
                 if np.abs(error).max(initial=0.0) <= TOLERANCE:
                     break
             basis = trial.basis(task.intervals)
-            task = replace(trial.task, correction=trial.correction)
+            task = replace(trial.task, corrections=trial.corrections)
         assert best is not None
         return best
 
     def _trial(self, task: WindowTask, basis: Basis | None) -> WindowPlan:
         """Solve the program of a task and carry its plan out in the simulator."""
-        intervals, admissible = task.intervals, self.admissible
-        task, problem, solution = self._solve(self._program(task), task, basis)
-        steps, layout = len(intervals), problem.layout
-        variables = solution.plan[: steps * layout.size].reshape(steps, -1)
-        actions = normalised_actions(admissible, layout, variables, intervals)
-        stocks, flows = self._simulator.run(task.stock, actions, intervals.start)
-        low = admissible.service_low[intervals.start : intervals.stop]
-        quantity = np.concatenate([stocks[1:], flows], axis=1) @ self._measure.T
-        level = np.divide(quantity, low, out=np.ones_like(low), where=low > 0)
-        error = np.where(low > 0, np.clip(self._quantity(problem, solution, task) - level, -1.0, 1.0), 0.0)
-        correction = Correction(error, *self._factors(variables, intervals))
-        promised = variables[:, layout.level : layout.imbalance]
-        merit = self._merit(task, flows, stocks[-1], np.minimum(level, 1.0))
-        return WindowPlan(task, problem, solution, actions, correction, promised, merit)
+        corrections = task.corrections or (None,) * len(self.futures)
+        parts = [f.program(task, correction) for f, correction in zip(self.futures, corrections, strict=True)]
+        joint = JointProgram.of(parts, task.demand)
+        task, solution = self._solve(joint.problem, task, basis)
+        triples = zip(self.futures, parts, joint.columns, strict=True)
+        trials = [future.trial(part, solution.plan[columns], task) for future, part, columns in triples]
+        merit, level = float(np.mean([t.value for t in trials])), np.mean([t.level for t in trials], axis=0)
+        if task.demand is not None:
+            share = len(task.intervals) / self._network.episode.horizon
+            merit -= float(task.price @ np.maximum(0.0, task.demand - level)) * share
+        promised = np.mean([trial.promised for trial in trials], axis=0)
+        corrections = tuple(trial.correction for trial in trials)
+        return WindowPlan(task, joint.problem, solution, trials[0].actions, corrections, promised, merit)
 
-    def _factors(self, variables: Floats, intervals: range) -> tuple[Floats, Floats]:
-        """Return the rates and valves of a plan, the neutral ones where nothing flows; see ``Correction``."""
-        admissible, layout = self.admissible, self._programs.layout
-        period = slice(intervals.start, intervals.stop)
-        stock, flow, through = layout.means(variables)
-        rate, valve = admissible.neutral_rate[period].copy(), admissible.neutral_valve[period].copy()
-        driver = stock[:, admissible.driver]
-        np.divide(flow, driver, out=rate, where=driver > 1e-12 * np.abs(flow))
-        held = stock[:, layout.valves]
-        valve[:, layout.valves] = np.divide(
-            through, held, out=valve[:, layout.valves], where=held > 1e-12 * np.abs(through)
-        )
-        return np.clip(rate, *admissible.rate[:, period]), np.clip(valve, *admissible.valve[:, period])
-
-    def _program(self, task: WindowTask) -> Program:
-        """Return the program of a task, corrected by what became of a plan before; its demand has a price."""
-        problem = self._programs.program(task.stock, task.demand, task.intervals)
-        layout, steps = problem.layout, len(task.intervals)
-        cost = problem.cost.reshape(steps, -1) * (steps / self._network.episode.horizon)
-        if task.later is not None:
-            cost += task.later.costs
-        problem = replace(problem, cost=cost.ravel())
-        if task.correction is not None:
-            rows, error = ProgramRows(layout, steps), task.correction.error
-            held_controls(self.admissible.driver, self._hold, task.correction.rate, task.correction.valve, rows)
-            low, under_to, rows_of_levels = problem.low.copy(), problem.under_to.copy(), level_rows(problem)
-            ends = self.admissible.service_low[task.intervals.start : task.intervals.stop]
-            under_to[rows_of_levels] -= (ends * error).ravel()
-            low[level_columns(problem)] = -np.maximum(error, 0.0).ravel()
-            matrix = rows.matrices()[0]
-            equal = sparse.vstack([problem.equal, matrix], format="csr")
-            equal_to = np.append(problem.equal_to, np.zeros(matrix.shape[0]))
-            problem = replace(problem, equal=equal, equal_to=equal_to, low=low, under_to=under_to)
-        if task.later is not None:
-            problem = with_distance(problem, task.later)
-        return problem if task.demand is None or not self._network.services else with_lack(problem)
-
-    def _solve(self, problem: Program, task: WindowTask, basis: Basis | None) -> tuple[WindowTask, Program, Solution]:
+    def _solve(self, problem: Program, task: WindowTask, basis: Basis | None) -> tuple[WindowTask, Solution]:
         """Solve a program, with a higher price of what lacks as long as that helps; the task comes back with it."""
         size = len(problem.cost), len(problem.equal_to) + len(problem.under_to)
         if basis is not None and (len(basis.columns), len(basis.rows)) != size:
@@ -206,13 +301,14 @@ class WindowPlanner:
         label = f"the program of MPC for decisions {task.intervals.start} to {task.intervals.stop - 1}"
         services, price, least, same_rows = len(self.first_price), task.price, None, False
         if task.demand is None or not services:
-            return task, problem, solve(problem, basis, label=label, certify=task.is_outlook)
+            return task, solve(problem, basis, label=label, certify=task.is_outlook)
         for rise in range(RISES + 1):
             problem.cost[-services:] = price * (len(task.intervals) / self._network.episode.horizon)
             solution = solve(problem, basis, label=label, certify=task.is_outlook, same_rows=same_rows)
             lack, basis, same_rows = solution.plan[-services:], solution.basis, solution.basis is not None
             # what comes after was priced beside this price: another one would weigh the two differently
-            if lack.max() <= SHORTFALL or task.later is not None or rise == RISES:
+            has_fixed_price = task.later is not None or (task.is_redrawn and not task.is_outlook)
+            if lack.max() <= SHORTFALL or has_fixed_price or rise == RISES:
                 break
             if least is None:
                 only_lack = replace(problem, cost=np.repeat([0.0, 1.0], [len(problem.cost) - services, services]))
@@ -223,39 +319,4 @@ class WindowPlanner:
         if task.is_outlook:  # what turns out dearer within windows is not left undone
             multipliers = -solution.certificate.under[-services:]
             price = np.where(lack > SHORTFALL, price, np.maximum(price, FIRST_PRICE * multipliers))
-        return replace(task, price=price), problem, solution
-
-    def _quantity(self, problem: Program, solution: Solution, task: WindowTask) -> Floats:
-        """Return q̂/l of a plan, shape (intervals, services)."""
-        layout, steps = problem.layout, len(task.intervals)
-        plan = solution.plan
-        low = self.admissible.service_low[task.intervals.start : task.intervals.stop]
-        levels = plan[: steps * layout.size].reshape(steps, -1)[:, layout.level : layout.imbalance]
-        activity = (problem.under[level_rows(problem)] @ plan).reshape(low.shape)  # l·level − q̂
-        quantity: Floats = low * levels - activity
-        return np.divide(quantity, low, out=np.zeros_like(low), where=low > 0)
-
-    def _merit(self, task: WindowTask, flows: Floats, end: Floats, levels: Floats) -> float:
-        """Return the objective that the simulator reaches, in parts of that of the episode."""
-        network, share = self._network, len(flows) / self._network.episode.horizon
-        weights = network.circularity_weights
-        per_interval = flows @ weights.sum(axis=0)
-        if network.objective.net_zero == "abs":
-            per_interval = flows @ weights[0] - np.abs(flows @ weights[1])
-        value = float(per_interval.mean()) * share
-        if self._weight is not None:
-            value = value / network.objective.circularity_scale
-            value += self._weight * share * float(levels.mean()) if levels.size else 0.0
-        if task.later is not None:
-            value -= self._later_cost(task.later, flows, self.admissible.lifetimes.start_planned @ end)
-        if task.demand is not None:
-            value -= float(task.price @ np.maximum(0.0, task.demand - levels.mean(axis=0))) * share
-        return value
-
-    def _later_cost(self, later: Continuation, flows: Floats, end: Floats) -> float:
-        """Return what an episode of the simulator leaves to later intervals, by its last stocks and its mean flows."""
-        layout, arcs = self._programs.layout, flows.shape[1]
-        by_flow = sum(later.costs[:, first : first + arcs] for first in layout.flow.tolist())
-        price = later.costs[-1, layout.last]
-        distance = DISTANCE * np.abs(price) @ np.abs(end - later.stocks)
-        return float(price @ end + distance + np.sum(by_flow * flows))
+        return replace(task, price=price), solution

@@ -8,6 +8,7 @@ Reference: Kerrigan and Maciejowski 2000, UKACC Control (exact penalties in mode
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated
 
@@ -53,8 +54,11 @@ class WindowTask:
     demand: Annotated[Floats | None, "mean level of each service over these, shape (services,); None for none"]
     later: Annotated[Continuation | None, "what comes after; None at the end of the episode"]
     price: Annotated[Floats, "of a unit of each service that the episode lacks, in the objective, shape (services,)"]
-    correction: Annotated[Correction | None, "of a plan before; None: controls may vary within an interval"]
+    corrections: Annotated[
+        tuple[Correction, ...] | None, "of a plan before, by future; None: controls may vary within an interval"
+    ]
     is_outlook: Annotated[bool, "whether the multipliers must be good, as they are the prices of later plans"] = False
+    is_redrawn: Annotated[bool, "whether other futures are planned for than before"] = False
 
 
 @positional_record
@@ -64,9 +68,9 @@ class WindowPlan:
     task: Annotated[WindowTask, "what was planned, at the price that was needed"]
     problem: Annotated[Program, "the program"]
     solution: Annotated[Solution, "its optimum"]
-    actions: Annotated[Floats, "normalised, shape (intervals, entries)"]
-    correction: Annotated[Correction, "what became of it"]
-    levels: Annotated[Floats, "that the program promises, shape (intervals, services)"]
+    actions: Annotated[Floats, "normalised, in the first of the futures, shape (intervals, entries)"]
+    corrections: Annotated[tuple[Correction, ...], "what became of it in each future"]
+    levels: Annotated[Floats, "that the program promises on average, shape (intervals, services)"]
     merit: Annotated[float, "objective reached there, less what is left to later intervals and what service lacks"]
 
     def basis(self, intervals: range) -> Basis | None:
@@ -74,14 +78,22 @@ class WindowPlan:
         own, basis = self.task.intervals, self.solution.basis
         if basis is None or len(intervals) == len(own):
             return basis
-        if intervals.stop != own.stop or intervals.start < own.start:
+        if len(self.corrections) > 1 or intervals.stop != own.stop or intervals.start < own.start:
             return None
         return basis.without_first(self.problem, intervals.start - own.start)
 
-    def corrections(self, intervals: range) -> Correction:
-        """Return what is expected of other ``intervals``: what became of these, the last of them from there on."""
-        own = self.task.intervals
-        return self.correction.of(np.clip(np.arange(intervals.start, intervals.stop) - own.start, 0, len(own) - 1))
+    def corrections_of(self, intervals: range, futures: int) -> tuple[Correction, ...]:
+        """Return what is expected of other ``intervals``: what became of these, the last of them from there on.
+
+        As other futures are drawn then, of several it is the mean: what is done in the first interval is one thing.
+        """
+        own, corrections = self.task.intervals, self.corrections
+        places = np.clip(np.arange(intervals.start, intervals.stop) - own.start, 0, len(own) - 1)
+        correction = corrections[0]
+        if len(corrections) > 1:
+            parts = ([getattr(c, name) for c in corrections] for name in ("error", "rate", "valve"))
+            correction = Correction(*(np.mean(part, axis=0) for part in parts))
+        return (correction.of(places),) * futures
 
     def continuation(self, intervals: range) -> Continuation:
         """Return what comes after some of the intervals, as planned here.
@@ -135,6 +147,66 @@ def with_distance(problem: Program, later: Continuation) -> Program:
         low=np.append(problem.low, np.zeros(2 * stores)),
         high=np.concatenate([problem.high, problem.high[last], later.stocks]),
     )
+
+
+@positional_record
+class JointProgram:
+    """The programs of a window in several futures as one, in which what is done in the first interval is the same."""
+
+    problem: Annotated[Program, "minimises the mean of their costs"]
+    parts: Annotated[tuple[Program, ...], "the programs"]
+    columns: Annotated[tuple[Integers, ...], "of the variables of each"]
+
+    @classmethod
+    def of(cls, parts: Sequence[Program], demand: Floats | None) -> JointProgram:
+        """Put programs together whose first intervals are alike.
+
+        Args:
+            parts: programs without a demand.
+            demand: mean level of each service over intervals and futures, shape (services,), to which the last rows
+                of G hold it; None if nothing is demanded.
+        """
+        common, count = parts[0].layout.size, len(parts)
+        sizes = [len(part.cost) for part in parts]
+        tops = np.cumsum([common, *(size - common for size in sizes)])
+        columns = tuple(
+            np.concatenate([np.arange(common), np.arange(top, top + size - common)])
+            for top, size in zip(tops.tolist(), sizes, strict=False)
+        )
+        width = int(tops[-1])
+        places = [
+            sparse.csr_array((np.ones(len(own)), (np.arange(len(own)), own)), shape=(len(own), width))
+            for own in columns
+        ]
+        problem = parts[0]
+        if count > 1:
+            cost, low, high = np.zeros(width), np.full(width, -np.inf), np.full(width, np.inf)
+            for part, own in zip(parts, columns, strict=True):
+                cost[own] += part.cost / count
+                low[own], high[own] = np.maximum(low[own], part.low), np.minimum(high[own], part.high)
+            pairs = list(zip(parts, places, strict=True))
+            problem = replace(
+                problem,
+                cost=cost,
+                equal=sparse.vstack([part.equal @ place for part, place in pairs], format="csr"),
+                equal_to=np.concatenate([part.equal_to for part in parts]),
+                under=sparse.vstack([part.under @ place for part, place in pairs], format="csr"),
+                under_to=np.concatenate([part.under_to for part in parts]),
+                low=low,
+                high=high,
+            )
+        if demand is not None and len(demand):
+            levels = [level_columns(part) for part in parts]
+            weight = -1.0 / (len(levels[0]) // len(demand) * count)
+            rows = [np.tile(np.arange(len(demand)), len(level) // len(demand)) for level in levels]
+            means = sum(
+                sparse.csr_array((np.full(len(level), weight), (row, own[level])), shape=(len(demand), width))
+                for level, row, own in zip(levels, rows, columns, strict=True)
+            )
+            means.sort_indices()
+            under = sparse.vstack([problem.under, means], format="csr")
+            problem = with_lack(replace(problem, under=under, under_to=np.append(problem.under_to, -demand)))
+        return cls(problem, tuple(parts), columns)
 
 
 def with_lack(problem: Program) -> Program:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.table import Table
 
-from cirl_marl.evaluation.comparison import FIGURES, Comparison
+from cirl_marl.evaluation.comparison import Comparison, Row
 from cirl_marl.evaluation.episode_count import EPISODES_DISTURBED, MOST_EPISODES
 from cirl_marl.evaluation.figures import provenance
 from cirl_marl.evaluation.pareto import ParetoFront
@@ -21,18 +22,26 @@ from cirl_marl.report.terminal import text_table
 
 COMPARISON_FILES = ("episodes.csv", "summary.csv", "summary.json", "comparison.png")
 PARETO_FILES = ("pareto.csv", "pareto.json", "pareto.png")
-FORMS = ("{:.4g}", "{:+.1%}", "{:.4f}", "{:.4g}", "{:.1%}")
+FORMS = {
+    "circularity": "{:.4g}",
+    "gain": "{:+.1%}",
+    "service": "{:.4f}",
+    "bound": "{:.4g}",
+    "gap": "{:.1%}",
+    "expected_gap": "{:.2%}",
+    "foresight_gap": "{:.2%}",
+}
 """How the figures of a comparison are written on screen."""
 
 
 def comparison_table(comparison: Comparison) -> Table:
-    """One row a recipe or controller: λ̄, gain, service level, bound and gap, with 95 % confidence intervals."""
+    """One row a recipe or controller: λ̄, gain, service, bound and gap with 95 % confidence intervals, and its time."""
     rows = []
     for row in comparison.rows:
         seeds = f"{len(row.seeds)} (few)" if row.has_few_seeds else str(len(row.seeds) or "")
-        figures = zip(FIGURES, FORMS, strict=True)
-        rows.append([row.name, seeds, *(_interval(row.figure(name), form) for name, form in figures)])
-    headings = ["policy", "seeds", f"λ̄ ({comparison.network.mass_unit})", *_headers(comparison)[1:]]
+        cells = [_interval(row.figure(name), FORMS[name]) for name in comparison.figures]
+        rows.append([row.name, seeds, *cells, f"{_milliseconds(row):.2g}"])
+    headings = ["policy", "seeds", f"λ̄ ({comparison.network.mass_unit})", *_headers(comparison)[1:], "ms a decision"]
     title = f"{comparison.episodes} fresh episodes, the same for all; 95 % confidence intervals in brackets"
     return text_table(title, headings, rows, text=["policy"])
 
@@ -62,7 +71,7 @@ def _worst_headers(comparison: Comparison) -> list[str]:
 def _worst(comparison: Comparison) -> list[list[str]]:
     """Return the cells of each row, in the order of ``_worst_headers``."""
     levels = ["{:.4f}"] * len(comparison.network.services)
-    forms = [*levels, FORMS[0], *levels]
+    forms = [*levels, FORMS["circularity"], *levels]
     return [[*map(_interval, [*row.levels(), *row.worst()], forms)] for row in comparison.rows]
 
 
@@ -80,6 +89,16 @@ def comparison_notes(comparison: Comparison) -> list[str]:
         notes.append(f"trained: {trained}; controllers: mean over episodes, Student's t")
     if any(row.has_few_seeds for row in comparison.rows):
         notes.append(f"few: fewer than {ENOUGH_SEEDS} training seeds; the interval says little, one seed has none")
+    calibrations = {row.name: row.entries[0].calibration for row in comparison.rows}
+    margins = [
+        f"{name} {calibration.margin:.4g}" for name, calibration in calibrations.items() if calibration is not None
+    ]
+    if margins:
+        notes.append(f"margins, set on other draws: {', '.join(margins)}")
+    for name, excess in comparison.misses().items():
+        notes.append(f"{name}: its expected service misses what is demanded by {excess:+.4f}")
+    if (expected := comparison.entries[0].uncertain_bound) is not None:
+        notes += [str(expected), "gaps: (bound − λ̄ − Σ μ·(service − demand)) of each draw over one scale"]
     if comparison.entries[0].bound is not None:
         foresight = "" if baseline.envelope is not None else ", whatever anybody knew of what was drawn,"
         episode = f"episode from the same start with at least the same level of each service{foresight}"
@@ -131,13 +150,20 @@ def summary_of(comparison: Comparison, **options: Any) -> dict[str, Any]:
     runs = [entry.run for entry in comparison.entries if entry.run is not None]
     rows = []
     for row in comparison.rows:
-        figures = {name: row.figure(name) for name in FIGURES}
+        figures = {name: row.figure(name) for name in comparison.figures}
         plain: dict[str, Any] = {k: None if figure is None else figure.as_dict() for k, figure in figures.items()}
         ids = [service.id for service in comparison.network.services]
         levels, (worst, *worst_levels) = row.levels(), row.worst()
         plain["worst_circularity"] = worst.as_dict()
         for name, parts in (("service_levels", levels), ("worst_service_levels", worst_levels)):
             plain[name] = {id_: part.as_dict() for id_, part in zip(ids, parts, strict=True)}
+        calibration = row.entries[0].calibration
+        plain["milliseconds"] = _milliseconds(row)
+        plain["calibration"] = (
+            None
+            if calibration is None
+            else {part.name: getattr(calibration, part.name) for part in fields(calibration)}
+        )
         rows.append({"name": row.name, "seeds": list(row.seeds), **plain})
     return {
         "provenance": provenance(comparison.network, runs, **options),
@@ -153,14 +179,28 @@ def summary_of(comparison: Comparison, **options: Any) -> dict[str, Any]:
 
 
 def _headers(comparison: Comparison) -> list[str]:
-    """Return FIGURES as headers with their units."""
+    """Return the figures as headers with their units."""
     mass = comparison.network.mass_unit
-    return [f"circularity ({mass})", "gain over neutral", "service level", f"bound ({mass})", "gap to bound"]
+    words = {
+        "circularity": f"circularity ({mass})",
+        "gain": "gain over neutral",
+        "service": "service level",
+        "bound": f"bound ({mass})",
+        "gap": "gap to bound",
+        "expected_gap": "gap to bound without foresight",
+        "foresight_gap": "gap to perfect information",
+    }
+    return [words[name] for name in comparison.figures]
+
+
+def _milliseconds(row: Row) -> float:
+    """Return the processor time of a decision, ms."""
+    return float(np.mean([entry.milliseconds for entry in row.entries]))
 
 
 def _episode_rows(comparison: Comparison) -> Iterator[list[object]]:
     for entry in comparison.entries:
-        columns = [getattr(entry, name) for name in FIGURES]
+        columns = [getattr(entry, name) for name in comparison.figures]
         run = None if entry.run is None else entry.run.path
         for episode in range(comparison.episodes):
             figures = [None if column is None else finite_or_none(column[episode]) for column in columns]
@@ -169,7 +209,7 @@ def _episode_rows(comparison: Comparison) -> Iterator[list[object]]:
 
 def _summary_rows(comparison: Comparison) -> Iterator[list[object]]:
     for row in comparison.rows:
-        figures = [row.figure(name) for name in FIGURES]
+        figures = [row.figure(name) for name in comparison.figures]
         cells = [[None] * 3 if figure is None else figure.as_dict().values() for figure in figures]
         yield [row.name, len(row.seeds) or None, *(cell for interval in cells for cell in interval)]
 
