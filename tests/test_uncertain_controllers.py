@@ -22,11 +22,10 @@ from cirl_marl.evaluation import calibration
 from cirl_marl.evaluation.calibration import calibrate
 from cirl_marl.network.disturbances import DisturbanceEffect, Markov
 from cirl_marl.network.processes import DisturbanceProcesses
-from cirl_marl.optimum import NoCertificate, mpc, simulate_plan
+from cirl_marl.optimum import NoCertificate, Sampling, mpc, simulate_plan
 from cirl_marl.optimum.blind import BestConstant, BestSchedule, Replay
 from cirl_marl.optimum.mpc import MPC, future_noise
 from cirl_marl.optimum.registry import named_controller
-from cirl_marl.optimum.uncertain_bound import Sampling
 
 Floats = NDArray[np.float64]
 
