@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import optimize, sparse
 from small_networks import CORRELATION, KINDS
 from test_disturbances import line
+from test_lifetimes import LIVES, town
 from test_optimum import certifiable
 
 from cirl_marl import (
@@ -38,6 +40,7 @@ from cirl_marl.evaluation import compare
 from cirl_marl.network.disturbances import BlockBootstrap, DisturbanceEffect, Gaussian, Markov
 from cirl_marl.network.innovations import innovations
 from cirl_marl.network.uncertainty import Spread, draw_network, expected_network
+from cirl_marl.network.elements import Lifetime
 from cirl_marl.optimum import NoCertificate, draws, price_fit, uncertain_bound
 from cirl_marl.optimum.draw_proofs import Sampling
 from cirl_marl.optimum.draws import Draw, DrawProgram, DrawProof, Prices
@@ -453,6 +456,33 @@ def merits(network: Network, found: Any, controller: Controller) -> tuple[Floats
     expected = np.array([found.prices.expected_stocks(draw.features) for draw in parts])
     apart = np.moveaxis(np.array(stocks[:-1]), 1, 0) - expected
     return circularity + found.prices.service_value(levels), np.einsum("itn,itn->i", weights, apart)
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("lifetime", LIVES)
+def test_prices_stand_on_all_that_is_in_use(lifetime: Lifetime) -> None:
+    """With a lifetime the simulator has stages or slots and the program vintages: in no draw does a policy earn more."""
+    order = Control(kind=ControlKind.FLOW, low=5.0, neutral=10.0, high=15.0)
+    network = town(lifetime, np.full(6, 10.0), initial=40.0)
+    buy = Arc(id="buy", donor="mine", recipient="use", law=Law.CONTROLLED, control=order)
+    network = replace(
+        network,
+        arcs=(buy, *network.arcs[1:]),
+        services=(Service(id="served", provider="use", quantity="stock", low=60.0),),
+        disturbances={"wanted": CHAIN},
+        disturbed={"services.served.low": DisturbanceEffect(by="wanted")},
+    )
+    env = MultiAgentVectorEnv(network, num_envs=8)
+    env.reset(seed=first_seed(0))
+    programs = [DrawProgram(draw, None, 1) for draw in draws.draws_of(env)]
+    for seed in range(3):
+        prices = prices_of(network, seed, 0.2, 0.5, 20.0)
+        values = np.array([program.prove(program.with_prices(prices)).value for program in programs])
+        played = SimpleNamespace(values=values, prices=prices, sampling=Sampling())
+        for policy in (Neutral(), Random(), Constant({"buy": 1.0}), Constant({"buy": -1.0})):
+            merit, penalty = merits(network, played, policy)
+            assert np.abs(penalty).max() > 0.1
+            assert (merit - penalty <= values + 1e-6).all()
 
 
 SEEDS = range(40)
