@@ -4,6 +4,9 @@ A cycle has 1 to 5 regions. In each, a mine is dug by order, a market without st
 waste is gathered from these, recycled or lost, and goes round: residence times from a week to a century, some furnaces
 and dumps of waste with stock and some without, trade between markets, numbers that change with the years.
 
+With ``--lifetimes`` there are more regions and products, and one to thirty of these live for times of all kinds, some
+of which agents prolong; some services are made up for from a mine, by agents or as usual.
+
 For each network the command bounds λ̄ with every service met at 95 %, verifies the certificate, and improves the plan
 until it keeps the services and comes within 1 % of the bound, or a minute has passed.
 """
@@ -14,6 +17,7 @@ import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Annotated
 
 import numpy as np
@@ -37,6 +41,7 @@ from cirl_marl import (
     Service,
 )
 from cirl_marl.controllers.rollout import Rollout
+from cirl_marl.network.elements import Lifetime
 from cirl_marl.optimum import bound, improve_plan, simulate_plan
 
 WEEK = 1 / 52
@@ -53,6 +58,45 @@ DEGREES = (2, 3, 4)
 """Degrees of the test polynomials, tried in turn while there is time."""
 ROUNDS, STALLED = 20, 5
 """Most linear programs of an improvement, and after how many of them it has to have got closer."""
+
+
+@dataclass(frozen=True)
+class Family:
+    """What networks are drawn from.
+
+    Attributes:
+        years: fewest and most of an episode.
+        regions: fewest and most.
+        products: fewest and most of a region.
+        lifetimes: fewest and most in all, as far as there are products; the others leave in proportion to their stock.
+        prolonged: how often agents prolong a lifetime.
+        supplied: how often a service of a stock in use is made up for.
+        idle: how often nobody acts on such a supply.
+    """
+
+    years: tuple[int, int] = (10, 40)
+    regions: tuple[int, int] = (1, 5)
+    products: tuple[int, int] = (1, 5)
+    lifetimes: tuple[int, int] = (0, 0)
+    prolonged: float = 0.0
+    supplied: float = 0.0
+    idle: float = 0.0
+
+
+RATES = Family()
+"""Cycles without lifetimes."""
+LIFETIMES = Family(years=(10, 50), products=(1, 8), lifetimes=(1, 30), prolonged=0.05, supplied=0.3, idle=0.3)
+"""Cycles with them."""
+KINDS = {
+    "normal": (0.2, 0.5),
+    "folded_normal": (0.2, 0.5),
+    "lognormal": (0.2, 0.7),
+    "weibull": (0.25, 0.7),
+    "gamma": (0.25, 0.7),
+    "exponential": (1.0, 1.0),
+    "fixed": (0.0, 0.0),
+}
+"""Least and greatest deviation of each kind of lifetime, in parts of its mean."""
 
 
 @dataclass(frozen=True)
@@ -80,10 +124,10 @@ class Outcome:
     reason: str = ""
 
 
-def planned(seed: int) -> Outcome:
+def planned(seed: int, family: Family = RATES) -> Outcome:
     """Bound the network of a seed, and improve its plan while there is time."""
     begun = time.process_time()
-    network = yearly_network(seed)
+    network = yearly_network(seed, family)
     size = len(network.nodes), network.episode.horizon
     scale = network.objective.circularity_scale
     best, proved, degree, reason, plan = -np.inf, np.inf, 0, "", None
@@ -126,14 +170,16 @@ def planned(seed: int) -> Outcome:
     return Outcome(seed, *size, proved / scale, gap, degree, seconds(), reason)
 
 
-def yearly_network(seed: int) -> Network:
-    """Return the network of a seed: 10 to 40 years, 5 to 60 nodes."""
-    rng = np.random.default_rng(seed)
-    years = int(rng.integers(10, 41))
-    cycle = _Cycle(rng, years)
-    regions = int(rng.integers(1, 6))
+def yearly_network(seed: int, family: Family = RATES) -> Network:
+    """Return the network of a seed: 5 to 60 nodes without lifetimes, up to 90 with them."""
+    rng, lives = np.random.default_rng(seed), np.random.default_rng((seed, 1))
+    years = int(rng.integers(*family.years, endpoint=True))
+    cycle = _Cycle(family, rng, lives, years, int(lives.integers(*family.lifetimes, endpoint=True)))
+    regions = int(rng.integers(*family.regions, endpoint=True))
     for region in range(regions):
         cycle.region(region, regions)
+    idle = {arc.id for arc in cycle.arcs if arc.makes_up_for and lives.random() < family.idle}
+    parts = (*cycle.nodes, *cycle.arcs)
     return Network(
         name=f"yearly_{seed}",
         nodes=tuple(cycle.nodes),
@@ -141,6 +187,7 @@ def yearly_network(seed: int) -> Network:
         services=tuple(cycle.services),
         episode=Episode(control_interval=1.0, horizon=years),
         objective=Objective(circularity_scale=cycle.demand),
+        default_agents=tuple(part.id for part in parts if part.control is not None and part.id not in idle),
         mass_unit="kt",
         time_unit="year",
     )
@@ -151,13 +198,19 @@ class _Cycle:
     """The parts drawn so far.
 
     Attributes:
+        family: from which they are drawn.
         rng: of the draws.
+        lives: of those of lifetimes and supplies, apart, so that a network without them is the same in all families.
         years: of an episode.
+        lifetimes: that are still to be drawn.
         demand: metal that all regions take up in a year, kt.
     """
 
+    family: Family
     rng: np.random.Generator
+    lives: np.random.Generator
     years: int
+    lifetimes: int
     nodes: list[Node] = field(default_factory=list)
     arcs: list[Arc] = field(default_factory=list)
     services: list[Service] = field(default_factory=list)
@@ -170,7 +223,7 @@ class _Cycle:
         name = f"r{region}"
         abroad = f"r{(region + 1) % regions}"
         self._mine(name, size)
-        products = int(rng.integers(1, 6))
+        products = int(rng.integers(*self.family.products, endpoint=True))
         weights = rng.dirichlet(np.full(products, 3.0))
         self._furnace(f"{name}_smelter", size, f"{name}_market")
         self._node(f"{name}_market", None)
@@ -227,9 +280,12 @@ class _Cycle:
     def _product(self, name: str, p: int, flow: float, weight: float, life: float) -> None:
         """Draw a product in use, in balance at first, of which a service asks for about as much as there is."""
         rng, node = self.rng, f"{name}_use_{p}"
-        stock = flow * life
         rate = self._changing(1.0 / life) if rng.random() < 0.3 else 1.0 / life
-        self.nodes.append(Node(id=node, initial=(stock, stock), rate=rate, scale=stock))
+        if self.lifetimes:
+            life = self._lifetime(node, flow)
+        else:
+            self.nodes.append(Node(id=node, initial=(flow * life,) * 2, rate=rate, scale=flow * life))
+        stock = flow * life
         self._share(f"{node}_loss", node, f"{name}_tip", float(rng.uniform(0.05, 0.3)), bool(rng.integers(2)))
         self.arcs.append(Arc(id=f"{node}_end", donor=node, recipient=f"{name}_waste", law=Law.SHARE))
         if rng.random() < 0.6 or p == 0:
@@ -242,6 +298,43 @@ class _Cycle:
                 low = Series(times=(0.0, float(self.years)), values=ends, interpolation="linear")
             provider, quantity = (node, "stock") if durable else (f"{name}_to_{p}", "flow")
             self.services.append(Service(id=f"{node}_needed", provider=provider, quantity=quantity, low=low))
+            if durable and self.lives.random() < self.family.supplied:
+                control = Control(
+                    kind=ControlKind.FLOW, low=0.0, neutral=0.0, high=float(self.lives.uniform(0.3, 1.5) * flow)
+                )
+                self.arcs.append(
+                    Arc(
+                        id=f"{node}_supply",
+                        donor=f"{name}_mine",
+                        recipient=node,
+                        law=Law.CONTROLLED,
+                        control=control,
+                        makes_up_for=f"{node}_needed",
+                        scale=flow,
+                    )
+                )
+
+    def _lifetime(self, node: str, flow: float) -> float:
+        """Draw a product that has grown by a rate and lives for a time; return the mean of this."""
+        lives, kind = self.lives, str(self.lives.choice(list(KINDS)))
+        mean, deviation = float(10 ** lives.uniform(0.2, 1.8)), float(lives.uniform(*KINDS[kind]))
+        mean = float(round(mean)) if kind == "fixed" else mean
+        control, stretch = None, 1.0 if kind == "fixed" or lives.random() > 0.2 else self._changing(1.0, rng=lives)
+        if kind != "fixed" and lives.random() < self.family.prolonged:
+            control = Control(kind=ControlKind.STRETCH, low=0.9, neutral=1.0, high=1.25)
+        self.lifetimes -= 1
+        self.nodes.append(
+            Node(
+                id=node,
+                initial=(flow * mean,) * 2,
+                lifetime=Lifetime(mean=mean, deviation=deviation * mean or None, distribution=kind),
+                growth=float(lives.uniform(-0.01, 0.03)),
+                stretch=stretch,
+                control=control,
+                scale=flow * mean,
+            )
+        )
+        return mean
 
     def _waste(self, name: str, abroad: str, size: float) -> None:
         """Draw what becomes of waste: recycled, exported, hoarded or lost."""
@@ -297,10 +390,10 @@ class _Cycle:
         else:
             self.arcs.append(Arc(id=name, donor=donor, recipient=recipient, law=Law.SHARE, share=share))
 
-    def _changing(self, value: float, most: float = 1.2) -> Series:
+    def _changing(self, value: float, most: float = 1.2, rng: np.random.Generator | None = None) -> Series:
         """Return a value that comes to 80 % or more of what it begins with, and at most to ``most``."""
         times = (0.0, self.years / 2, float(self.years))
-        ends = value * np.array([1.0, *self.rng.uniform(0.8, most, 2)])
+        ends = value * np.array([1.0, *(rng or self.rng).uniform(0.8, most, 2)])
         return Series(times=times, values=tuple(ends.tolist()), interpolation="linear")
 
 
@@ -308,13 +401,15 @@ def main(
     seeds: Annotated[int, typer.Option(help="How many networks, from the first seed on.")] = SEEDS,
     first: Annotated[int, typer.Option(help="First seed.")] = 0,
     jobs: Annotated[int, typer.Option(help="Networks planned side by side.")] = 1,
+    lifetimes: Annotated[bool, typer.Option("--lifetimes", help="Of the family with lifetimes.")] = False,
 ) -> None:
     """Plan generated networks, and tell which gaps do not close."""
     console = Console(width=None if sys.stdout.isatty() else 120)
     outcomes: list[Outcome] = []
     with ProcessPoolExecutor(jobs) as pool, Progress(console=console) as progress:
         task = progress.add_task("networks", total=seeds)
-        for outcome in pool.map(planned, range(first, first + seeds)):
+        plan = partial(planned, family=LIFETIMES if lifetimes else RATES)
+        for outcome in pool.map(plan, range(first, first + seeds)):
             outcomes.append(outcome)
             closed = sum(not each.reason for each in outcomes)
             progress.update(task, advance=1, description=f"{closed} of {len(outcomes)} closed")

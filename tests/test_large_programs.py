@@ -10,22 +10,40 @@ import pytest
 from scipy import sparse
 from small_networks import cycle
 
-from cirl_marl import load_network
+from cirl_marl import Network, load_network
 from cirl_marl.optimum import bound, improve, improve_plan, program, reach, simulate_plan, solver
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.improve import penalised_objective, prices
 
 
-@pytest.mark.parametrize(("scenario", "merged"), [(None, False), ("longer_lives", True)])
+@pytest.mark.parametrize(("network", "merged"), [(load_network("steel_japan"), False), (cycle(), True)])
 def test_pieces_are_merged_where_stocks_are_fast(
-    scenario: str | None, merged: bool, monkeypatch: pytest.MonkeyPatch
+    network: Network, merged: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A large program has one piece a year; rows about its end only if stages of lifetimes turn over in it."""
-    admissible = Admissible.of(load_network("steel_japan", scenario=scenario))
+    """A large program has one piece a year; rows about its end only if stocks turn over in it."""
+    admissible = Admissible.of(network)
     fine = program._layout(admissible, 2, False, 1)
     monkeypatch.setattr(program, "LARGE", 0)
     layout = program._layout(admissible, 2, None, 1)
     assert (fine.pieces, layout.pieces, layout.coarse, layout.has_end_flows) == (2, 1, True, merged)
+
+
+@pytest.mark.parametrize(("limit", "pieces"), [("LARGE", 2), ("LARGE_KERNELS", 2)])
+def test_as_many_pieces_stay_as_a_program_may_have(limit: str, pieces: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Variables grow with the pieces, rows of lifetimes with their square; both become as many as is allowed."""
+    admissible = Admissible.of(load_network("copper_world"))
+    fine = program._layout(admissible, 99, False, 2)
+    counted = {
+        "LARGE": fine.size * admissible.network.episode.horizon,
+        "LARGE_KERNELS": admissible.lifetimes.entries(fine),
+    }
+    share = (pieces + 0.5) / fine.pieces
+    allowed = {"LARGE": counted["LARGE"] * share, "LARGE_KERNELS": counted["LARGE_KERNELS"] * share**2}
+    monkeypatch.setattr(program, "MERGED", 1.0)
+    monkeypatch.setattr(program, "LARGE", 10**9)
+    monkeypatch.setattr(program, limit, allowed[limit])
+    assert fine.pieces > pieces
+    assert program._layout(admissible, 99, None, 2).pieces == pieces
 
 
 @pytest.mark.medium

@@ -12,7 +12,8 @@ from scipy.linalg import expm
 from test_lifetimes import INFLOW, LIVES, town
 
 from benchmarks.products import product_cycle
-from cirl_marl import MultiAgentVectorEnv, Series, Service
+from benchmarks.yearly import LIFETIMES, yearly_network
+from cirl_marl import Control, ControlKind, MultiAgentVectorEnv, Series, Service
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.network.elements import Lifetime
@@ -84,7 +85,7 @@ def test_rows_and_boxes_hold_in_an_episode(lifetime: Lifetime, stretch: float | 
     short = network.with_options(episode={"control_interval": 1.0 / steps, "horizon": years * steps})
     run = rollout(MultiAgentVectorEnv(short, num_envs=1), Neutral())
     left = weighted(run.flow[:, network.arc_index["discard"]].reshape(-1, FINE), 2).reshape(years, -1)
-    (each,) = lifetimes.passive
+    (each,) = lifetimes.whole
     values = np.zeros((years, layout.size))
     for i, moment in enumerate(layout.moments):
         values[:, layout.flow[moment] + each.exit_arc] = left[:, i]
@@ -95,6 +96,39 @@ def test_rows_and_boxes_hold_in_an_episode(lifetime: Lifetime, stretch: float | 
     # and they leave little room
     room = (to - matrix @ values.ravel()).max()
     assert room < 1e-2 * left.max()
+
+
+@pytest.mark.parametrize("style", ["ends", "inside", "switch"])
+@pytest.mark.parametrize("lifetime", [LIVES[0], LIVES[2], Lifetime(mean=12.0, deviation=3.0, distribution="lognormal")])
+def test_rows_hold_however_a_lifetime_is_stretched(lifetime: Lifetime, style: str) -> None:
+    """Those of the stock and of what leaves in a year, in episodes and in later parts of them."""
+    years, rng = 16, np.random.default_rng(len(style))
+    control = Control(kind=ControlKind.STRETCH, low=0.8, neutral=1.0, high=1.3)
+    changing = Series(times=(0.0, 9.0), values=(1.0, 1.1))
+    inflow = rng.uniform(0, 20, years)
+    network = town(lifetime, inflow, initial=40.0, growth=0.02, stretch=changing, control=control)
+    admissible = Admissible.of(network)
+    programs, lifetimes = Programs(admissible, 2, None), admissible.lifetimes
+    layout, (whole,) = programs.layout, lifetimes.whole
+    for turn in range(20):
+        actions = rng.choice([-1.0, 1.0], years) if style == "ends" else rng.uniform(-1, 1, years)
+        if style == "switch":  # the least first, then the most, or the other way round
+            actions = np.where((np.arange(years) < rng.integers(years)) == (turn % 2 == 0), -1.0, 1.0)
+        env = MultiAgentVectorEnv(network, num_envs=1)
+        env.reset(seed=0)
+        values, starts = np.zeros((years, layout.size)), []
+        for year, action in enumerate(actions):
+            starts.append(env.physical.stock[env.rows.nodes, 0].copy())
+            outcome = env.advance(np.array([[action]]))
+            for flow in layout.flow:
+                values[year, flow + whole.exit_arc] = outcome.flow[network.arc_index["discard"], 0]
+                values[year, flow + whole.inflow_arcs[0]] = inflow[year]
+            values[year, layout.end + network.node_index["use"]] = env.rows.stocks(env.physical.stock)[1, 0]
+        for first in (0, 5):
+            matrix, to = lifetimes.rows(layout, starts[first], range(first, years))
+            assert (matrix @ values[first:].ravel() <= to + 1e-9 * to.max()).all()
+        stretches = lifetimes.planned_stretches(layout, values, starts[0], range(years))["use"]
+        np.testing.assert_allclose(stretches, 0.8 + 0.5 * (actions + 1) / 2, rtol=1e-6)
 
 
 @pytest.mark.sample(3)
@@ -113,6 +147,31 @@ def test_what_leaves_at_once_is_allowed(mean: float, deviation: float, degree: i
     served = replace(network, services=(Service(id="old", provider="discard", quantity="flow", low=low),))
     level = float(rollout(MultiAgentVectorEnv(served, num_envs=1), Neutral()).episode_levels[0, 0])
     assert bound(served, min_service=level * (1 - 1e-6), degree=degree).levels[0] >= level * (1 - 1e-5)
+
+
+@pytest.mark.medium
+@pytest.mark.sample(1)
+@pytest.mark.parametrize("seed", [3, 11, 32, 34, 48])
+def test_no_episode_of_a_generated_cycle_exceeds_its_bound(seed: int) -> None:
+    """Neither random ones nor the plan, at the services that they have, whoever stretches lifetimes or supplies."""
+    network = yearly_network(seed, replace(LIFETIMES, years=(8, 10), prolonged=0.7, supplied=0.7, idle=0.5))
+    env = MultiAgentVectorEnv(network, num_envs=40)
+    env.reset(seed=seed)
+    rng, circularity, entries = np.random.default_rng(seed), np.zeros(40), len(env.stack(env.neutral_action))
+    for _ in range(network.episode.horizon):
+        actions = rng.uniform(-1, 1, (entries, 40))
+        circularity += env.advance(
+            np.where(rng.random(actions.shape) < 0.5, actions, np.sign(actions))
+        ).circularity_mean
+    circularity, levels = circularity / network.episode.horizon, env.physical.service.T / network.episode.horizon
+    for copy in (circularity.argmax(), levels.sum(axis=1).argmax()):
+        found = bound(network, min_service=levels[copy] * (1 - 1e-6), degree=1)
+        assert found.verify().bound == found.objective
+        same = (levels >= levels[copy]).all(axis=1)
+        assert circularity[same].max() <= found.objective + 1e-9 * abs(found.objective)
+        run = simulate_plan(found)
+        if (run.episode_levels[0] >= levels[copy]).all():
+            assert run.episode_circularity[0] <= found.objective + 1e-9 * abs(found.objective)
 
 
 def test_a_delay_is_exact() -> None:

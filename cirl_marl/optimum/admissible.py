@@ -99,7 +99,8 @@ class Admissible:
                 if network.compartments[id_].control is not None:
                     stretch = _control_range(network, network.compartments[id_], agents)
                     valve[:, :, network.node_index[store]] = 1.0 / stretch[::-1]
-        setting[0][:, lifetimes.exit_arcs] = 0.0  # what leaves at the end of a life may be nothing
+        # what leaves at the end of a life may be nothing
+        setting[0][:, lifetimes.exit_arcs], setting[2][:, lifetimes.exit_arcs] = 0.0, lifetimes.most_factor
         for k, arc in enumerate(network.arcs):
             compartment = _setter(network, arc)
             if compartment is not None:
@@ -263,17 +264,20 @@ def _exclusions(network: Network) -> Iterator[str]:
         yield f"nobody foresees what disturbs it ({names}); a program is of a draw, or of what is expected"
 
 
-def normalised_actions(admissible: Admissible, layout: Layout, plan: Floats, intervals: range | None = None) -> Floats:
+def normalised_actions(
+    admissible: Admissible, layout: Layout, plan: Floats, initial: Floats, intervals: range | None = None
+) -> Floats:
     """Return the actions whose constant factors give the planned mean flows at the planned mean stocks.
 
     v = Z̄/X̄ where a node has several outflows, else what its outflow asks with its own control neutral; then
     w_k = f̄_k/(a_k·v·X̄_p) and u_k = f̄_k/v, each clipped to its range. A share is such a w_k, of what is released. A
-    stretch is 1/v, v being that of all stages together.
+    stretch is what leaves the planned stock at the end of the interval.
 
     Args:
         admissible: ranges of the factors.
         layout: of the variables.
         plan: variables of each interval, shape (steps, size).
+        initial: stocks of the simulator at the start, shape (stocks,), mass.
         intervals: of the episode, whose first were planned; None is all of them.
 
     Returns:
@@ -292,16 +296,12 @@ def normalised_actions(admissible: Admissible, layout: Layout, plan: Floats, int
             valve[:, donor] = _ratio(flow[:, k], unit, valve[:, donor])
     for z, node in enumerate(layout.valves):
         valve[:, node] = _ratio(through[:, z], stock[:, node], valve[:, node])
-    if isinstance(network, StagedNetwork):
-        for lifetime_node in dict.fromkeys(network.valves.values()):
-            arcs = [k for k in np.flatnonzero(by_donor) if network.valves.get(network.arcs[k].donor) == lifetime_node]
-            unit, place = base[:, arcs] * stock[:, network.donors[arcs]], network.node_index[lifetime_node]
-            valve[:, place] = _ratio(flow[:, arcs].sum(axis=1), unit.sum(axis=1), valve[:, place])
     # what is left of f̄_k after the valve is the arc's own factor, w_k = f̄_k/(a_k·v·X̄_p)
     valve = np.clip(valve, *valve_range)
     driver = np.where(admissible.by_schedule, 1.0, stock[:, admissible.driver])
     setting = np.clip(_ratio(flow, base * driver * valve[:, network.donors], neutral), *admissible.setting[:, period])
     actuators, steps = admissible.actuators, np.arange(period.start, period.stop)
+    stretches = admissible.lifetimes.planned_stretches(layout, plan, initial, range(period.start, period.stop))
     actions = np.zeros((len(steps), len(actuators.control_rows)))
     for agent, entries in actuators.entries.items():
         control = network.compartments[agent].control
@@ -311,7 +311,7 @@ def normalised_actions(admissible: Admissible, layout: Layout, plan: Floats, int
         elif control.kind is ControlKind.RATE:
             physical = valve[:, network.node_index[agent]]
         elif control.kind is ControlKind.STRETCH:
-            physical = 1.0 / valve[:, network.node_index[agent]]
+            physical = stretches[agent]
         else:
             outflows = np.flatnonzero(network.donors == network.node_index[agent])
             physical = setting[:, next(k for k in outflows if network.arcs[k].law is Law.CONTROLLED)]

@@ -341,7 +341,7 @@ def _solve_bound(
         circularity=circularity,
         stock=stocks @ lifetimes.totals.T,
         flow=layout.means(plan)[1][:, : len(lifetimes.network.arcs)],
-        actions=normalised_actions(admissible, layout, plan),
+        actions=normalised_actions(admissible, layout, plan, start),
         problem=problem,
         solution=solution.plan,
         certificate=solution.certificate,

@@ -150,7 +150,7 @@ def refine(
         except (Infeasible, SolverFailure):  # more than can be had: what was found so far is the plan
             break
         layout = programs.layout
-        actions = normalised_actions(demand_ranges, layout, variables.reshape(-1, layout.size))
+        actions = normalised_actions(demand_ranges, layout, variables.reshape(-1, layout.size), bound.initial)
         candidate = replace(bound, actions=actions)
         trial = simulate_plan(candidate)
         progress((done + 1) / REFINEMENT_ROUNDS)

@@ -6,6 +6,7 @@ flows weighted with B_i. Integration by parts and the flow laws hold for them ex
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any
 
 import numpy as np
@@ -31,8 +32,13 @@ from cirl_marl.optimum.quasi_steady import decay_rows, end_laws, has_fast_stocks
 from cirl_marl.optimum.reach import ComparisonSystem, Reach
 from cirl_marl.optimum.vintages import Lifetimes
 
-LARGE = 30_000
-"""Variables beyond which the substeps of an interval are merged, into one piece or, from degree 3 on, d − 1."""
+LARGE, MERGED = 30_000, 1 / 3
+"""Variables beyond which the substeps of an interval are merged, into so few pieces that there are that part of these.
+
+There is at least one piece, or from degree 3 on d − 1.
+"""
+LARGE_KERNELS = 1_000_000
+"""Entries of the rows of lifetimes, which grow with the square of the pieces, beyond which there are only so many."""
 
 
 @frozen_record
@@ -179,14 +185,15 @@ class Programs:
 def _reach(lifetimes: Lifetimes, system: ComparisonSystem, initial: Floats, intervals: range) -> tuple[Reach, Floats]:
     """Return what the planned network can reach, and the most that leaves lifetimes, shape (steps, lifetimes)."""
     interval, steps = lifetimes.network.episode.control_interval, range(len(intervals))
-    lines = [(passive, passive.slots(initial)) for passive in lifetimes.passive if not len(passive.rate)]
+    lines = [(whole, whole.slots(initial)) for whole in lifetimes.whole if not len(whole.rate)]
     reach = system.reach(lifetimes.start_reached @ initial, intervals, lines)
+    period = slice(intervals.start, intervals.stop)
     most = [
-        passive.rate[intervals.start : intervals.stop] * reach.upper[:, passive.reached_node]
-        + passive.chain.weights[0] * reach.upper[:, passive.reached_entry]
-        if len(passive.rate)
-        else np.array([passive.most_out(passive.slots(initial), t, reach.inflow) for t in steps]) / interval
-        for passive in lifetimes.passive
+        whole.rate[period] * factor * reach.upper[:, whole.reached_node]
+        + whole.chain.weights[0] * reach.upper[:, whole.reached_entry]
+        if len(whole.rate)
+        else np.array([whole.most_out(whole.slots(initial), t, reach.inflow) for t in steps]) / interval
+        for whole, factor in zip(lifetimes.whole, lifetimes.most_factor[period].T, strict=True)
     ]
     upper = reach.upper @ lifetimes.nodes_reached.T
     lifetime_flow = np.array(most).reshape(len(most), len(steps)).T
@@ -195,20 +202,24 @@ def _reach(lifetimes: Lifetimes, system: ComparisonSystem, initial: Floats, inte
 
 def _layout(admissible: Admissible, substeps: int, merge_pieces: bool | None, degree: int) -> Layout:
     network, nodes = admissible.network, len(admissible.network.nodes)
-    pieces = admissible.lifetimes.pieces(degree, substeps) if admissible.lifetimes.passive else substeps
+    pieces = admissible.lifetimes.pieces(degree, substeps) if admissible.lifetimes.whole else substeps
     exits = np.bincount(network.donors[admissible.driver == network.donors], minlength=nodes)
     schedules = np.bincount(network.donors[admissible.by_schedule], minlength=nodes)
     movable = (admissible.valve[0] < admissible.valve[1]).any(axis=0)
     valves = np.flatnonzero(movable & ((exits > 1) | (exits > 0) & (schedules > 0)))
     free_valves = np.flatnonzero(movable & (exits > 0) & (schedules > 0))
     fine = Layout(network, pieces, degree, valves, free_valves, coarse=pieces < substeps)
-    least_pieces = max(1, degree - 1)
-    is_large = fine.size * network.episode.horizon > LARGE if merge_pieces is None else merge_pieces
-    if pieces <= least_pieces or not is_large:
+    variables, entries = fine.size * network.episode.horizon, admissible.lifetimes.entries(fine)
+    fewer = 0.0 if merge_pieces else float(pieces)
+    if merge_pieces is None and variables > LARGE:
+        fewer *= MERGED * LARGE / variables
+    if merge_pieces is None and entries > LARGE_KERNELS:
+        fewer = min(fewer, pieces * math.sqrt(LARGE_KERNELS / entries))
+    fewer_pieces = max(int(fewer), degree - 1, 1)
+    if pieces <= fewer_pieces:
         return fine
-    length = network.episode.control_interval / least_pieces
-    has_end_flows = bool(merge_pieces) or has_fast_stocks(admissible, length)
-    return Layout(network, least_pieces, degree, valves, free_valves, coarse=True, has_end_flows=has_end_flows)
+    has_end_flows = bool(merge_pieces) or has_fast_stocks(admissible, network.episode.control_interval / fewer_pieces)
+    return Layout(network, fewer_pieces, degree, valves, free_valves, coarse=True, has_end_flows=has_end_flows)
 
 
 def _box(

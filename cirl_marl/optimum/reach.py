@@ -21,7 +21,7 @@ from cirl_marl.dynamics.visit_bounds import VisitBounds
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import Admissible, IntervalRanges, NoCertificate
-from cirl_marl.optimum.vintages import PassiveLifetime
+from cirl_marl.optimum.vintages import WholeLifetime
 
 DENSE = 256
 """Rows of the largest system whose solution is kept as matrices."""
@@ -187,7 +187,7 @@ class ComparisonSystem:
         self._linear: dict[int, Linear] = {}
 
     def reach(
-        self, initial: Floats, intervals: range, delay_lines: Sequence[tuple[PassiveLifetime, Floats]] = ()
+        self, initial: Floats, intervals: range, delay_lines: Sequence[tuple[WholeLifetime, Floats]] = ()
     ) -> Reach:
         """Bound the stocks from ``initial``, shape (stores,), on, over the given intervals of the episode.
 

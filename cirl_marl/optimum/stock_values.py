@@ -36,17 +36,9 @@ def stock_values(programs: Programs, problem: Program, certificate: Certificate,
         )
         tops = [top + block.shape[0] for top, block in zip(tops, blocks, strict=True)]
     last = len(mu) - demands
-    for passive in reversed(lifetimes.passive):
-        out = lifetimes.of_new(passive, problem.layout)
-        rows = out.shape[1]
-        above, below = mu[last - 2 * rows : last - rows], mu[last - rows : last]
-        worth[:, plan_network.node_index[passive.node.id]] -= out @ (above - below)
-        last -= 2 * rows
-    of_nodes = worth[:, : len(lifetimes.network.stores)].copy()
-    stages = getattr(plan_network, "stages", {})
-    for i, node in enumerate(lifetimes.network.stores):
-        if len(stages.get(node.id, ())) > 1 and node.lifetime is not None and node.lifetime.chain is not None:
-            shares = node.lifetime.chain.inflow_shares
-            columns = [plan_network.node_index[stage] for stage in stages[node.id]]
-            of_nodes[:, i] = worth[:, columns] @ (shares / shares.sum())
-    return of_nodes
+    for whole in reversed(lifetimes.whole):
+        limits = lifetimes.of_new(whole, problem.layout)
+        rows = limits.shape[1]
+        worth[:, plan_network.node_index[whole.node.id]] -= limits @ mu[last - rows : last]
+        last -= rows
+    return worth[:, : len(lifetimes.network.stores)]

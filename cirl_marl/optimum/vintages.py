@@ -1,4 +1,4 @@
-"""What leaves at the end of uncontrolled lifetimes, from what entered and when: rows without stages.
+"""What leaves at the end of lifetimes, from what entered and when: rows without stages.
 
 What leaves a chain of stages is linear in what has entered it, u, and in what it held at the start. Weighted with B_i
 over a piece p it is ::
@@ -11,7 +11,8 @@ not negative, neither are any of the means in
 
     known_i + w_0 U_i + Σ_q Σ_j c̲_j U_qj ≤ L_i ≤ known_i + w_0 U_i + Σ_q Σ_j c̄_j U_qj
 
-(theorem 4 of docs/bound.md). What leaves a fixed lifetime is the mean inflow of one interval, or known.
+(theorem 4 of docs/bound.md). What leaves a fixed lifetime is the mean inflow of one interval, or known. Rows of
+lifetimes that an agent stretches: ``stretched``.
 """
 
 from __future__ import annotations
@@ -32,20 +33,22 @@ from cirl_marl.network.elements import Node
 from cirl_marl.network.lifetimes import Chain
 from cirl_marl.optimum.kernels import Kernel, unit_outflow
 from cirl_marl.optimum.matrices import Layout
+from cirl_marl.optimum.stretched import StretchedRows, planned_turnovers
 
 LOOSE = 2e-4
 """Distance of the bounds of what leaves, relative to it, above which intervals have more pieces."""
 
 
 @positional_record
-class PassiveLifetime:
-    """A lifetime that nobody controls."""
+class WholeLifetime:
+    """A lifetime as the program has it."""
 
     node: Annotated[Node, "whose it is"]
     rows: Annotated[Integers, "of its stages, or slots, among the stocks of the simulator"]
     exit_arc: Annotated[int, "the arc of the planned network through which what has lived goes"]
     inflow_arcs: Annotated[Integers, "its arcs through which something enters"]
     rate: Annotated[Floats, "μ in each interval, shape (steps,), 1/time; empty for a fixed one"]
+    factor: Annotated[Floats, "least and most that an agent multiplies it with, shape (2, steps); empty if nobody does"]
     reached_node: Annotated[int, "the node, or its last stage, among the nodes of ``reached``"]
     reached_entry: Annotated[int, "where what enters is among them; the node itself of a fixed one"]
     reached_arc: Annotated[int, "``leaving`` among its arcs"]
@@ -68,7 +71,7 @@ class PassiveLifetime:
 
 
 class Lifetimes:
-    """A network as its program sees it: controlled lifetimes as chains, the others whole.
+    """A network as its program sees it, with its lifetimes whole.
 
     Attributes:
         network: as it is given.
@@ -76,8 +79,9 @@ class Lifetimes:
         state_layout: which row of its stocks is what.
         plan_network: as the program has it.
         reach_network: as stocks are bounded, all lifetimes but fixed ones being chains.
-        passive: the lifetimes that nobody controls.
+        whole: the lifetimes.
         exit_arcs: arcs of the planned network that come out of these.
+        most_factor: most that multiplies what comes out of each, shape (steps, lifetimes).
         start_planned: what the stores of the planned network hold of the stocks of the simulator, (stores, stocks).
         start_reached: what the stores of ``reach_network`` hold of them, likewise.
         nodes_reached: what the nodes of the planned network are of those of ``reach_network``, shape (nodes, nodes).
@@ -90,36 +94,44 @@ class Lifetimes:
         self.network = self.plan_network = self.reach_network = network
         self.simulator_network = simulated_network(network)
         self.state_layout = StateLayout(self.simulator_network)
-        self.passive: list[PassiveLifetime] = []
+        self.whole: list[WholeLifetime] = []
         self._kernels: dict[tuple[str, bytes, int, int], Kernel] = {}
+        self._stretched_cache: dict[tuple[str, bytes, int, int], StretchedRows] = {}
         nodes = [node for node in network.stores if node.lifetime is not None]
-        whole = [node for node in nodes if not (node.id in agents and node.control is not None)]
         if nodes:
-            fixed_nodes = [node.id for node in whole if node.lifetime is not None and node.lifetime.chain is None]
-            self.plan_network = staged_network(network, {node.id for node in whole})
+            fixed_nodes = [node.id for node in nodes if node.lifetime is not None and node.lifetime.chain is None]
+            self.plan_network = staged_network(network, {node.id for node in nodes})
             self.reach_network = staged_network(network, fixed_nodes)
         plan_network, reach_network = self.plan_network, self.reach_network
-        neutral = network.control_bounds[1]
-        for node in whole:
+        for node in nodes:
             assert isinstance(plan_network, StagedNetwork) and node.lifetime is not None
-            place, chain, rate = network.node_index[node.id], node.lifetime.chain, np.zeros(0)
+            place, chain, rate, factor = network.node_index[node.id], node.lifetime.chain, np.zeros(0), np.zeros((2, 0))
             if chain is not None:
                 rate = chain.rate / node.lifetime.mean / network.interval_means(node.stretch)
                 if node.control is not None:
-                    rate = rate / neutral[network.control_rows[node.id].start]
-            self.passive.append(
-                PassiveLifetime(
+                    high, neutral, low = 1.0 / network.control_bounds[:, network.control_rows[node.id].start]
+                    if node.id in agents:
+                        factor = np.stack([low, high])
+                    else:
+                        rate = rate * neutral
+            self.whole.append(
+                WholeLifetime(
                     node=node,
                     rows=self.state_layout.stages.get(place, np.array([place])),
                     exit_arc=plan_network.arc_index[plan_network.release_arcs[node.id]],
                     inflow_arcs=np.flatnonzero(plan_network.recipients == plan_network.node_index[node.id]),
                     rate=rate,
+                    factor=factor,
                     reached_entry=reach_network.node_index[node.id if chain is None else f"{node.id}.entry"],
                     reached_node=reach_network.node_index[node.id],
                     reached_arc=reach_network.arc_index[plan_network.release_arcs[node.id]],
                 )
             )
-        self.exit_arcs = np.array([lifetime.exit_arc for lifetime in self.passive], dtype=np.intp)
+        self.exit_arcs = np.array([lifetime.exit_arc for lifetime in self.whole], dtype=np.intp)
+        self.most_factor = np.ones((network.episode.horizon, len(self.whole)))
+        for place, lifetime in enumerate(self.whole):
+            if lifetime.factor.size:
+                self.most_factor[:, place] = lifetime.factor[1]
         stocks = self.state_layout.nodes.stop
         self.start_planned = _sums(self.simulator_network, plan_network)[: len(plan_network.stores), :stocks]
         self.start_reached = _sums(self.simulator_network, reach_network)[: len(reach_network.stores), :stocks]
@@ -130,24 +142,29 @@ class Lifetimes:
     def pieces(self, degree: int, most: int) -> int:
         """Return the pieces of an interval, at most ``most``, in which stocks turn over once and kernels are smooth."""
         interval, turnover = self.network.episode.control_interval, ArcRates(self.plan_network).turnover
-        chains = [lifetime for lifetime in self.passive if len(lifetime.rate)]
+        chains = [lifetime for lifetime in self.whole if len(lifetime.rate)]
         for lifetime in chains:
             turnover[self.plan_network.donors[lifetime.exit_arc]] = 0.0
         pieces = max(1, math.ceil(interval * float(turnover.max(initial=0.0)) - 1e-9))
         for lifetime in chains:
-            while pieces < most and self._looseness(lifetime, pieces, degree) > LOOSE:
+            while not lifetime.factor.size and pieces < most and self._looseness(lifetime, pieces, degree) > LOOSE:
                 pieces += 1
         return min(pieces, most)
 
-    def _looseness(self, lifetime: PassiveLifetime, pieces: int, degree: int) -> float:
+    def _looseness(self, lifetime: WholeLifetime, pieces: int, degree: int) -> float:
         """Return how far bounds of what leaves are apart, relative to it, where as much enters all the time."""
         rate = np.full(pieces * self.network.episode.horizon, lifetime.rate.max())
         kernel = Kernel(lifetime.chain, rate, self.network.episode.control_interval / pieces, degree)
         low, high = (bound[-1].sum(axis=(1, 2)) for bound in (kernel.low, kernel.high))
         return float(((high - low) / high).max())
 
+    def entries(self, layout: Layout) -> int:
+        """Return how many entries the rows of an episode have, about."""
+        moments = self.network.episode.horizon * len(layout.moments)
+        return moments**2 * sum(len(whole.inflow_arcs) for whole in self.whole if len(whole.rate))
+
     def rows(self, layout: Layout, initial: Floats, intervals: range) -> tuple[Any, Floats]:
-        """Return the rows G v ≤ g of all lifetimes that nobody controls, and g.
+        """Return the rows G v ≤ g of all lifetimes, and g.
 
         Args:
             layout: of the variables of the planned network.
@@ -156,38 +173,90 @@ class Lifetimes:
         """
         blocks: list[Any] = [sparse.csr_array((0, layout.size * len(intervals)))]
         limits = [np.zeros(0)]
-        for lifetime in self.passive:
+        first = (layout.size * np.arange(len(intervals))[:, None] + layout.flow).ravel()[:, None]
+        ends = (layout.size * np.arange(len(intervals))[:, None] + layout.end).ravel()[:, None]
+        width = layout.size * len(intervals)
+        for lifetime in self.whole:
+            outflow = _column_sums(first + lifetime.exit_arc, width)
+            inflow = _column_sums(first + lifetime.inflow_arcs, width)
+            if lifetime.factor.size:
+                stretched, node = self._stretched(lifetime, layout, intervals), lifetime.node.id
+                stock = _column_sums(ends + self.plan_network.node_index[node], width)
+                blocks.append(stretched.matrix(stock, outflow, inflow))
+                limits.append(stretched.limits(initial[lifetime.rows]))
+                continue
             # L − c̄ U ≤ from_start and c̲ U − L ≤ −from_start, in the columns of what leaves and of what enters
             write = self._chain_kernels if len(lifetime.rate) else self._line_kernels
             low, high, from_start = write(lifetime, layout, initial, intervals)
-            first = (layout.size * np.arange(len(intervals))[:, None] + layout.flow).ravel()[:, None]
-            width = layout.size * len(intervals)
-            outflow = _column_sums(first + lifetime.exit_arc, width)
-            inflow = _column_sums(first + lifetime.inflow_arcs, width)
             blocks.append(sparse.vstack([outflow - high @ inflow, low @ inflow - outflow], format="csr"))
             limits.append(np.concatenate([from_start, -from_start]))
         return sparse.vstack(blocks, format="csr"), np.concatenate(limits)
 
-    def of_new(self, lifetime: PassiveLifetime, layout: Layout) -> Floats:
-        """Return what leaves of a unit of mass that is new in a stock at the start of each interval of an episode.
+    def of_new(self, lifetime: WholeLifetime, layout: Layout) -> Floats:
+        """Return what a unit of mass that is new in a stock at the start of each interval adds to the limits of rows.
 
         In a fixed lifetime it counts as what entered in the interval before.
 
         Returns:
-            Its means by moment, in the order of the first half of the lifetime's rows, 1/time, shape
-            (steps, steps · moments).
+            Shape (steps, rows of the lifetime).
         """
         steps, moments = self.network.episode.horizon, len(layout.moments)
-        if not len(lifetime.rate):
+        if lifetime.factor.size:
+            return self._stretched_new(lifetime, layout)
+        if len(lifetime.rate):
+            rate = np.repeat(lifetime.rate, layout.pieces)
+            outflow = unit_outflow(lifetime.chain, rate, layout.length, layout.degree)
+            outflow = outflow[:: layout.pieces].reshape(steps, -1)
+        else:
             delay = len(lifetime.rows) - 1
             shares = np.kron(np.eye(steps, k=delay - 1), np.ones((1, moments)))
-            return np.asarray(shares / self.network.episode.control_interval, dtype=float)
-        rate = np.repeat(lifetime.rate, layout.pieces)
-        outflow = unit_outflow(lifetime.chain, rate, layout.length, layout.degree)
-        return outflow[:: layout.pieces].reshape(steps, -1)
+            outflow = np.asarray(shares / self.network.episode.control_interval, dtype=float)
+        return np.concatenate([outflow, -outflow], axis=1)
+
+    def planned_stretches(self, layout: Layout, plan: Floats, initial: Floats, intervals: range) -> dict[str, Floats]:
+        """Return the stretches of a plan, by agent: those that leave its stocks at the end of each interval.
+
+        Args:
+            layout: of the variables.
+            plan: variables of each interval, shape (steps, size).
+            initial: stocks of the simulator at the start, shape (stocks,), mass.
+            intervals: that were planned.
+        """
+        period, stretches = slice(intervals.start, intervals.stop), {}
+        flow, interval = layout.means(plan)[1], self.network.episode.control_interval
+        for lifetime in self.whole:
+            if lifetime.factor.size:
+                once = lifetime.rate[period] * interval
+                entered = flow[:, lifetime.inflow_arcs].sum(axis=1) * interval
+                stock = plan[:, layout.last][:, self.plan_network.node_index[lifetime.node.id]]
+                turnover, masses = once * lifetime.factor[:, period], initial[lifetime.rows]
+                stretches[lifetime.node.id] = once / planned_turnovers(lifetime.chain, turnover, masses, entered, stock)
+        return stretches
+
+    def _stretched_new(self, lifetime: WholeLifetime, layout: Layout) -> Floats:
+        """Return ``of_new`` of a lifetime that is stretched."""
+        steps, new = self.network.episode.horizon, lifetime.chain.inflow_shares / lifetime.chain.inflow_shares.sum()
+        parts = np.array([layout.pieces, layout.pieces, 1, 1])
+        added = np.zeros((steps, steps * int(parts.sum())))
+        for step in range(steps):
+            later = self._stretched(lifetime, layout, range(step, steps)).limits(new)
+            starts, counts = np.cumsum([0, *parts[:-1]]) * steps, (steps - step) * parts
+            # of each family the rows of earlier intervals come first
+            rows = [np.arange(top + step * part, top + steps * part) for top, part in zip(starts, parts, strict=True)]
+            assert len(later) == counts.sum()
+            added[step, np.concatenate(rows)] = later
+        return added
+
+    def _stretched(self, lifetime: WholeLifetime, layout: Layout, intervals: range) -> StretchedRows:
+        period = slice(intervals.start, intervals.stop)
+        rate, factor = lifetime.rate[period], lifetime.factor[:, period]
+        key = (lifetime.node.id, (rate * factor).tobytes(), layout.pieces, layout.degree)
+        if key not in self._stretched_cache:
+            self._stretched_cache[key] = StretchedRows(lifetime.chain, rate, factor, layout)
+        return self._stretched_cache[key]
 
     def _chain_kernels(
-        self, lifetime: PassiveLifetime, layout: Layout, initial: Floats, intervals: range
+        self, lifetime: WholeLifetime, layout: Layout, initial: Floats, intervals: range
     ) -> tuple[Any, Any, Floats]:
         """Return c̲ and c̄ of what leaves a chain, sparse, and what leaves of what is there at the start."""
         rate = lifetime.rate[intervals.start : intervals.stop]
@@ -199,7 +268,7 @@ class Lifetimes:
         return low, high, (kernel.start_outflow @ initial[lifetime.rows]).ravel()
 
     def _line_kernels(
-        self, lifetime: PassiveLifetime, layout: Layout, initial: Floats, intervals: range
+        self, lifetime: WholeLifetime, layout: Layout, initial: Floats, intervals: range
     ) -> tuple[Any, Any, Floats]:
         """Return the same of a fixed lifetime, out of which comes the mean inflow of one interval."""
         slots = lifetime.slots(initial)

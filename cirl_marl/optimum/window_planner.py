@@ -179,7 +179,7 @@ class Future:
         """
         intervals, admissible, layout = task.intervals, self.admissible, problem.layout
         variables = plan[: len(intervals) * layout.size].reshape(len(intervals), -1)
-        actions = normalised_actions(admissible, layout, variables, intervals)
+        actions = normalised_actions(admissible, layout, variables, task.stock, intervals)
         stocks, flows = self._simulator.run(task.stock, actions, intervals.start)
         low = admissible.service_low[intervals.start : intervals.stop]
         quantity = np.concatenate([stocks[1:], flows], axis=1) @ self._measure.T

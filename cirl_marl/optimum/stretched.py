@@ -1,0 +1,196 @@
+"""Lifetimes that an agent stretches, from what entered and when: rows without stages, and the stretches of a plan.
+
+Stages pass on in proportion to μ·v, v being what the agent sets and θ = ∫ μ v dt how much they turn over. Of what
+entered at τ the share S(θ(t) − θ(τ)) is left, and θ lies between what the least and the greatest v make of it. As S
+falls, so does what is left at the end of a piece lie between what is left with these (theorem 5 of docs/bound.md),
+
+    Σ σ̲_qj U_qj + known ≤ N ≤ Σ σ̄_qj U_qj + known,
+
+and of what entered in an interval q what leaves in a later one p is at most the largest S(θ) − S(θ + μ v̄ h), and at
+least the smallest S(θ) − S(θ + μ v̲ h), for turnovers θ that are possible from the one to the other.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from scipy import sparse, special
+
+from cirl_marl.network import Floats
+from cirl_marl.network.lifetimes import Chain
+from cirl_marl.optimum.kernels import Kernel
+from cirl_marl.optimum.matrices import Layout
+
+CELL = 0.02
+"""Turnover of a cell, at the ends of which survival is computed; between them it is enclosed, as it falls."""
+TAIL = 12.0
+"""Standard deviations of what is left beyond which nothing is."""
+WIDER = 1.0 + 1e-9
+"""Factor by which what may leave is widened for rounding errors, which are far smaller."""
+HALVINGS = 40
+"""Of the range of a factor, until it is that of a plan."""
+
+
+class StretchedRows:
+    """The rows of a lifetime over some intervals: of the stock at the end of each piece, and of what leaves in each.
+
+    There are four families: the most and the least stock, the most and the least that leaves.
+    """
+
+    def __init__(self, chain: Chain, rate: Floats, factor: Floats, layout: Layout) -> None:
+        """Take μ and the least and most that multiplies it, shape (steps,) and (2, steps)."""
+        self._layout, self._steps = layout, len(rate)
+        by_piece = np.repeat(rate * factor, layout.pieces, axis=1)
+        self._kernels = [Kernel(chain, each, layout.length, layout.degree) for each in by_piece]
+        self._windows = _Windows(rate, factor, layout.network.episode.control_interval)
+        self._low, self._high = _interval_bounds(chain, self._windows)
+
+    def matrix(self, stock: Any, outflow: Any, inflow: Any) -> Any:
+        """Return the rows.
+
+        Args:
+            stock: what picks the stock at the end of each piece, sparse, shape (pieces, variables).
+            outflow: what picks the means of what leaves, by moment, sparse, shape (moments, variables).
+            inflow: likewise of what enters.
+        """
+        layout, (longest, shortest) = self._layout, self._kernels
+        sums = sparse.kron(sparse.eye_array(self._steps), np.full((1, len(layout.moments)), layout.portion))
+        left, entered = sums @ outflow, sums @ inflow
+        rows = [
+            stock - self._left(longest.low) @ inflow,
+            self._left(shortest.high) @ inflow - stock,
+            left - sparse.csr_array(self._high) @ entered,
+            sparse.csr_array(self._low) @ entered - left,
+        ]
+        return sparse.vstack(rows, format="csr")
+
+    def limits(self, masses: Floats) -> Floats:
+        """Return the limits of the rows from masses in the stages."""
+        most, least = (
+            masses.sum() - self._layout.portion * np.cumsum((kernel.start_outflow @ masses).sum(axis=1))
+            for kernel in self._kernels
+        )
+        low, high = _start_bounds(masses, self._windows)
+        return np.concatenate([most, -least, high, -low])
+
+    def _left(self, leaving: Floats) -> Any:
+        """Return what is left at the end of each piece of what entered in each moment, (pieces, moments), sparse.
+
+        It is the most if ``leaving``, shape (pieces, d + 1, pieces, d + 1), is the least, and the other way round.
+        """
+        pieces, portion = len(leaving), self._layout.portion
+        entered = np.kron(np.tri(pieces), np.full((1, leaving.shape[1]), portion))
+        return sparse.csr_array(entered - portion * np.cumsum(leaving.sum(axis=1), axis=0).reshape(pieces, -1))
+
+
+class _Windows:
+    """How much stages can turn over: between intervals, and in each.
+
+    Attributes:
+        in_interval: least and most in each interval, shape (2, steps).
+        between: least and most from some time in interval q to the start of interval p > q, shape (2, p, q).
+        before: least and most from the start to that of each interval, shape (2, steps).
+    """
+
+    def __init__(self, rate: Floats, factor: Floats, interval: float) -> None:
+        """Take μ and the least and most that multiplies it, shape (steps,) and (2, steps)."""
+        self.in_interval = rate * factor * interval
+        total = np.concatenate([np.zeros((2, 1)), np.cumsum(self.in_interval, axis=1)], axis=1)
+        self.before = total[:, :-1]
+        self.between = np.stack([total[0, :-1, None] - total[0, None, 1:], total[1, :-1, None] - total[1, None, :-1]])
+
+
+class _Leaving:
+    """Bounds of what leaves in an interval of masses by the stages that they have to go."""
+
+    def __init__(self, survivors: Floats, turnover: Floats) -> None:
+        """Take what is left at the ends of cells, falling, and the least and most turnover of the interval."""
+        last, size = survivors[-1], len(survivors)
+        least, most = int(np.floor(turnover[0] / CELL)), int(np.ceil(turnover[1] / CELL))
+        after = np.concatenate([survivors, np.full(most + 2, last)])
+        cells = np.arange(size)
+        self._most = after[cells] - after[cells + 1 + most]
+        self._least = np.maximum(after[cells + 1] - after[cells + least], 0.0)
+
+    def within(self, low: float, high: float) -> tuple[float, float]:
+        """Return the least and most where they have turned over between ``low`` and ``high`` times before."""
+        first = min(int(low / CELL), len(self._most) - 1)
+        cells = slice(first, max(first, int(np.ceil(high / CELL))) + 1)
+        return float(self._least[cells].min()) / WIDER, float(self._most[cells].max()) * WIDER
+
+
+def _survivors(masses: Floats) -> Floats:
+    """Return what is left at the ends of cells of masses by stage, first the one with most to go; it is 0 at last."""
+    return np.append(masses @ _survival(len(masses)), 0.0)
+
+
+@lru_cache(maxsize=4)
+def _survival(stages: int) -> Floats:
+    """Return what is left at the ends of cells of what has ``stages`` to go, or fewer, shape (stages, ends)."""
+    turnover = np.arange(0.0, stages + TAIL * np.sqrt(stages) + 2 * TAIL, CELL)
+    left: Floats = special.gammaincc(np.arange(stages, 0, -1)[:, None], turnover)
+    return left
+
+
+def _interval_bounds(chain: Chain, windows: _Windows) -> tuple[Floats, Floats]:
+    """Return the least and most that leaves in interval p of a unit of mass that enters in q, shape (steps, steps)."""
+    steps, entering = windows.in_interval.shape[1], _survivors(chain.inflow_shares)
+    low, high = np.zeros((2, steps, steps))
+    by_turnover: dict[bytes, _Leaving] = {}
+    for p in range(steps):
+        turnover = windows.in_interval[:, p]
+        if (key := turnover.tobytes()) not in by_turnover:
+            by_turnover[key] = _Leaving(entering, turnover)
+        leaving = by_turnover[key]
+        low[p, p] = chain.weights[0] / WIDER
+        cell = min(int(turnover[1] / CELL) + 1, len(entering) - 1)
+        high[p, p] = (chain.weights[0] + entering[0] - entering[cell]) * WIDER
+        for q in range(p):
+            low[p, q], high[p, q] = leaving.within(*windows.between[:, p, q].tolist())
+    return low, high
+
+
+def _start_bounds(masses: Floats, windows: _Windows) -> tuple[Floats, Floats]:
+    """Return the least and most that leaves in each interval of what is there at the start, shape (steps,) each."""
+    left = _survivors(masses)
+    bounds = [
+        _Leaving(left, turnover).within(*before)
+        for turnover, before in zip(windows.in_interval.T, windows.before.T.tolist(), strict=True)
+    ]
+    low, high = np.array(bounds).T
+    return low, high
+
+
+def planned_turnovers(chain: Chain, turnover: Floats, masses: Floats, inflow: Floats, stock: Floats) -> Floats:
+    """Return the turnover of each interval that leaves a planned stock at its end, or as near as may be.
+
+    Args:
+        chain: the stages.
+        turnover: least and most, shape (2, steps).
+        masses: in the stages at the start.
+        inflow: mass that enters in each interval, evenly, shape (steps,).
+        stock: planned, shape (steps,), mass.
+
+    Returns:
+        Shape (steps,).
+    """
+    found = np.empty(len(stock))
+    for t, (low, high) in enumerate(turnover.T.tolist()):
+        for _ in range(HALVINGS if low < high else 0):
+            middle = (low + high) / 2
+            too_much = _after(chain, middle, masses, float(inflow[t])).sum() > stock[t]
+            low, high = (middle, high) if too_much else (low, middle)
+        found[t] = (low + high) / 2
+        masses = _after(chain, found[t], masses, float(inflow[t]))
+    return found
+
+
+def _after(chain: Chain, turnover: float, masses: Floats, inflow: float) -> Floats:
+    """Return what is in the stages after they have turned over so often, with an even inflow, mass."""
+    passed = np.arange(chain.stages)
+    stay = np.exp(passed * np.log(turnover) - turnover - special.gammaln(passed + 1))
+    entered = inflow / turnover * special.gammainc(passed + 1, turnover)
+    moved = np.convolve(masses, stay) + np.convolve(chain.inflow_shares, entered)
+    return np.asarray(moved[: chain.stages])
