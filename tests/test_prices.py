@@ -13,8 +13,9 @@ from test_lifetimes import INFLOW, LIVES, town
 from test_optimum import RESERVE, TIP, USE, order, valve
 from test_optimum import small as timed
 
-from cirl_marl import Arc, Network, Service, load_network
+from cirl_marl import Arc, Control, ControlKind, Network, Service, load_network
 from cirl_marl.network.disturbances import DisturbanceEffect, Markov
+from cirl_marl.network.elements import Lifetime
 from cirl_marl.network.series import in_intervals
 from cirl_marl.optimum import Bound, NoCertificate, bound
 from cirl_marl.optimum.admissible import Admissible
@@ -91,11 +92,14 @@ def test_a_service_that_needs_its_throughput() -> None:
     assert found.stock[0, 1] > 0.2 and found.stock[0, 0] == pytest.approx(0.0, abs=1e-9)
 
 
-@pytest.mark.parametrize("lifetime", LIVES)
-def test_what_lives_is_new(lifetime: object) -> None:
-    """Of products that are new at time t those that die by the end count 1/T in λ̄, as the survival function says."""
-    years = 12
-    network = town(lifetime, INFLOW[:years], initial=30.0)  # type: ignore[arg-type]
+@pytest.mark.parametrize(("lifetime", "longest"), [*((lifetime, 1.0) for lifetime in LIVES), (LIVES[0], 1.3)])
+def test_what_lives_is_new(lifetime: Lifetime, longest: float) -> None:
+    """Of products that are new at time t those that die by the end count 1/T in λ̄, as the survival function says.
+
+    Who may prolong lives does so as much as can be.
+    """
+    years, stretch = 12, Control(kind=ControlKind.STRETCH, low=0.9, neutral=1.0, high=longest)
+    network = town(lifetime, INFLOW[:years], initial=30.0, control=stretch if longest > 1 else None)
     found = shadow_prices(network)
     (node,) = [i for i, each in enumerate(network.stores) if each.lifetime is not None]
     given = network.stores[node].lifetime
@@ -107,7 +111,7 @@ def test_what_lives_is_new(lifetime: object) -> None:
         dead = (left >= given.mean).astype(float)
     else:
         at_once = given.chain.weights[0]
-        dead = 1 - given.chain.survival(left / given.mean) / (1 - at_once)
+        dead = 1 - given.chain.survival(left / given.mean / longest) / (1 - at_once)
     np.testing.assert_allclose(found.stock[:, node], per_tonne * dead / years, atol=2e-4 * abs(per_tonne) / years)
 
 
