@@ -59,8 +59,8 @@ class StretchedRows:
         sums = sparse.kron(sparse.eye_array(self._steps), np.full((1, len(layout.moments)), layout.portion))
         left, entered = sums @ outflow, sums @ inflow
         rows = [
-            stock - self._left(longest.low) @ inflow,
-            self._left(shortest.high) @ inflow - stock,
+            stock - self._survivor_rows(longest.low) @ inflow,
+            self._survivor_rows(shortest.high) @ inflow - stock,
             left - sparse.csr_array(self._high) @ entered,
             sparse.csr_array(self._low) @ entered - left,
         ]
@@ -75,14 +75,14 @@ class StretchedRows:
         low, high = _start_bounds(masses, self._windows)
         return np.concatenate([most, -least, high, -low])
 
-    def _left(self, leaving: Floats) -> Any:
+    def _survivor_rows(self, discards: Floats) -> Any:
         """Return what is left at the end of each piece of what entered in each moment, (pieces, moments), sparse.
 
-        It is the most if ``leaving``, shape (pieces, d + 1, pieces, d + 1), is the least, and the other way round.
+        It is the most if ``discards``, shape (pieces, d + 1, pieces, d + 1), is the least, and the other way round.
         """
-        pieces, portion = len(leaving), self._layout.portion
-        entered = np.kron(np.tri(pieces), np.full((1, leaving.shape[1]), portion))
-        return sparse.csr_array(entered - portion * np.cumsum(leaving.sum(axis=1), axis=0).reshape(pieces, -1))
+        pieces, portion = len(discards), self._layout.portion
+        entered = np.kron(np.tri(pieces), np.full((1, discards.shape[1]), portion))
+        return sparse.csr_array(entered - portion * np.cumsum(discards.sum(axis=1), axis=0).reshape(pieces, -1))
 
 
 class _Windows:
@@ -102,7 +102,7 @@ class _Windows:
         self.between = np.stack([total[0, :-1, None] - total[0, None, 1:], total[1, :-1, None] - total[1, None, :-1]])
 
 
-class _Leaving:
+class _DiscardBounds:
     """Bounds of what leaves in an interval of masses by the stages that they have to go."""
 
     def __init__(self, survivors: Floats, turnover: Floats) -> None:
@@ -138,17 +138,17 @@ def _interval_bounds(chain: Chain, windows: _Windows) -> tuple[Floats, Floats]:
     """Return the least and most that leaves in interval p of a unit of mass that enters in q, shape (steps, steps)."""
     steps, entering = windows.in_interval.shape[1], _survivors(chain.inflow_shares)
     low, high = np.zeros((2, steps, steps))
-    by_turnover: dict[bytes, _Leaving] = {}
+    by_turnover: dict[bytes, _DiscardBounds] = {}
     for p in range(steps):
         turnover = windows.in_interval[:, p]
         if (key := turnover.tobytes()) not in by_turnover:
-            by_turnover[key] = _Leaving(entering, turnover)
-        leaving = by_turnover[key]
+            by_turnover[key] = _DiscardBounds(entering, turnover)
+        discards = by_turnover[key]
         low[p, p] = chain.weights[0] / WIDER
         cell = min(int(turnover[1] / CELL) + 1, len(entering) - 1)
         high[p, p] = (chain.weights[0] + entering[0] - entering[cell]) * WIDER
         for q in range(p):
-            low[p, q], high[p, q] = leaving.within(*windows.between[:, p, q].tolist())
+            low[p, q], high[p, q] = discards.within(*windows.between[:, p, q].tolist())
     return low, high
 
 
@@ -156,7 +156,7 @@ def _start_bounds(masses: Floats, windows: _Windows) -> tuple[Floats, Floats]:
     """Return the least and most that leaves in each interval of what is there at the start, shape (steps,) each."""
     left = _survivors(masses)
     bounds = [
-        _Leaving(left, turnover).within(*before)
+        _DiscardBounds(left, turnover).within(*before)
         for turnover, before in zip(windows.in_interval.T, windows.before.T.tolist(), strict=True)
     ]
     low, high = np.array(bounds).T

@@ -96,7 +96,7 @@ class Lifetimes:
         self.state_layout = StateLayout(self.simulator_network)
         self.whole: list[WholeLifetime] = []
         self._kernels: dict[tuple[str, bytes, int, int], Kernel] = {}
-        self._stretched_cache: dict[tuple[str, bytes, int, int], StretchedRows] = {}
+        self._stretch_cache: dict[tuple[str, bytes, int, int], StretchedRows] = {}
         nodes = [node for node in network.stores if node.lifetime is not None]
         if nodes:
             fixed_nodes = [node.id for node in nodes if node.lifetime is not None and node.lifetime.chain is None]
@@ -180,10 +180,10 @@ class Lifetimes:
             outflow = _column_sums(first + lifetime.exit_arc, width)
             inflow = _column_sums(first + lifetime.inflow_arcs, width)
             if lifetime.factor.size:
-                stretched, node = self._stretched(lifetime, layout, intervals), lifetime.node.id
+                stretch, node = self._stretch_rows(lifetime, layout, intervals), lifetime.node.id
                 stock = _column_sums(ends + self.plan_network.node_index[node], width)
-                blocks.append(stretched.matrix(stock, outflow, inflow))
-                limits.append(stretched.limits(initial[lifetime.rows]))
+                blocks.append(stretch.matrix(stock, outflow, inflow))
+                limits.append(stretch.limits(initial[lifetime.rows]))
                 continue
             # L − c̄ U ≤ from_start and c̲ U − L ≤ −from_start, in the columns of what leaves and of what enters
             write = self._chain_kernels if len(lifetime.rate) else self._line_kernels
@@ -202,7 +202,7 @@ class Lifetimes:
         """
         steps, moments = self.network.episode.horizon, len(layout.moments)
         if lifetime.factor.size:
-            return self._stretched_new(lifetime, layout)
+            return self._stretch_new(lifetime, layout)
         if len(lifetime.rate):
             rate = np.repeat(lifetime.rate, layout.pieces)
             outflow = unit_outflow(lifetime.chain, rate, layout.length, layout.degree)
@@ -233,13 +233,13 @@ class Lifetimes:
                 stretches[lifetime.node.id] = once / planned_turnovers(lifetime.chain, turnover, masses, entered, stock)
         return stretches
 
-    def _stretched_new(self, lifetime: WholeLifetime, layout: Layout) -> Floats:
+    def _stretch_new(self, lifetime: WholeLifetime, layout: Layout) -> Floats:
         """Return ``of_new`` of a lifetime that is stretched."""
         steps, new = self.network.episode.horizon, lifetime.chain.inflow_shares / lifetime.chain.inflow_shares.sum()
         parts = np.array([layout.pieces, layout.pieces, 1, 1])
         added = np.zeros((steps, steps * int(parts.sum())))
         for step in range(steps):
-            later = self._stretched(lifetime, layout, range(step, steps)).limits(new)
+            later = self._stretch_rows(lifetime, layout, range(step, steps)).limits(new)
             starts, counts = np.cumsum([0, *parts[:-1]]) * steps, (steps - step) * parts
             # of each family the rows of earlier intervals come first
             rows = [np.arange(top + step * part, top + steps * part) for top, part in zip(starts, parts, strict=True)]
@@ -247,13 +247,13 @@ class Lifetimes:
             added[step, np.concatenate(rows)] = later
         return added
 
-    def _stretched(self, lifetime: WholeLifetime, layout: Layout, intervals: range) -> StretchedRows:
+    def _stretch_rows(self, lifetime: WholeLifetime, layout: Layout, intervals: range) -> StretchedRows:
         period = slice(intervals.start, intervals.stop)
         rate, factor = lifetime.rate[period], lifetime.factor[:, period]
         key = (lifetime.node.id, (rate * factor).tobytes(), layout.pieces, layout.degree)
-        if key not in self._stretched_cache:
-            self._stretched_cache[key] = StretchedRows(lifetime.chain, rate, factor, layout)
-        return self._stretched_cache[key]
+        if key not in self._stretch_cache:
+            self._stretch_cache[key] = StretchedRows(lifetime.chain, rate, factor, layout)
+        return self._stretch_cache[key]
 
     def _chain_kernels(
         self, lifetime: WholeLifetime, layout: Layout, initial: Floats, intervals: range
