@@ -4,7 +4,7 @@ A cycle has 1 to 5 regions. In each, a mine is dug by order, a market without st
 waste is gathered from these, recycled or lost, and goes round: residence times from a week to a century, some furnaces
 and dumps of waste with stock and some without, trade between markets, numbers that change with the years.
 
-With ``--lifetimes`` there are more regions and products, and one to thirty of these live for times of all kinds, some
+With ``--family lifetimes`` there are more products, and one to thirty of these live for times of all kinds, some
 of which agents prolong; some services are made up for from a mine, by agents or as usual.
 
 For each network the command bounds λ̄ with every service met at 95 %, verifies the certificate, and improves the plan
@@ -41,6 +41,7 @@ from cirl_marl import (
     Service,
 )
 from cirl_marl.controllers.rollout import Rollout
+from cirl_marl.errors import unknown_name
 from cirl_marl.network.elements import Lifetime
 from cirl_marl.optimum import bound, improve_plan, simulate_plan
 
@@ -87,6 +88,11 @@ RATES = Family()
 """Cycles without lifetimes."""
 LIFETIMES = Family(years=(10, 50), products=(1, 8), lifetimes=(1, 30), prolonged=0.05, supplied=0.3, idle=0.3)
 """Cycles with them."""
+REGIONAL = Family(years=(40, 40), regions=(4, 4), products=(2, 2), lifetimes=(8, 8), supplied=0.3)
+"""Four regions with two products each."""
+LARGE = Family(years=(50, 50), regions=(7, 7), products=(4, 6), lifetimes=(30, 30), supplied=0.3)
+"""Seven regions, and thirty lifetimes."""
+FAMILIES = {"rates": RATES, "lifetimes": LIFETIMES, "regional": REGIONAL, "large": LARGE}
 KINDS = {
     "normal": (0.2, 0.5),
     "folded_normal": (0.2, 0.5),
@@ -401,15 +407,16 @@ def main(
     seeds: Annotated[int, typer.Option(help="How many networks, from the first seed on.")] = SEEDS,
     first: Annotated[int, typer.Option(help="First seed.")] = 0,
     jobs: Annotated[int, typer.Option(help="Networks planned side by side.")] = 1,
-    lifetimes: Annotated[bool, typer.Option("--lifetimes", help="Of the family with lifetimes.")] = False,
+    family: Annotated[str, typer.Option(help=f"What they are drawn from: {', '.join(FAMILIES)}.")] = "rates",
 ) -> None:
     """Plan generated networks, and tell which gaps do not close."""
     console = Console(width=None if sys.stdout.isatty() else 120)
+    if (drawn_from := FAMILIES.get(family)) is None:
+        raise typer.BadParameter(f"--family: {unknown_name('family', family, FAMILIES)}")
     outcomes: list[Outcome] = []
     with ProcessPoolExecutor(jobs) as pool, Progress(console=console) as progress:
         task = progress.add_task("networks", total=seeds)
-        plan = partial(planned, family=LIFETIMES if lifetimes else RATES)
-        for outcome in pool.map(plan, range(first, first + seeds)):
+        for outcome in pool.map(partial(planned, family=drawn_from), range(first, first + seeds)):
             outcomes.append(outcome)
             closed = sum(not each.reason for each in outcomes)
             progress.update(task, advance=1, description=f"{closed} of {len(outcomes)} closed")
