@@ -27,10 +27,10 @@ from cirl_marl.controllers import Controller, Neutral, ScriptController
 from cirl_marl.controllers.basic import Arrays
 from cirl_marl.controllers.rollout import Rollout, first_seed, rollout
 from cirl_marl.evaluation.statistics import over_episodes, worst_mean
-from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.series import Series, Value
 from cirl_marl.network.uncertainty import expected_network
+from cirl_marl.optimum.blind import Replay
 from cirl_marl.optimum.mpc import MPC
 from cirl_marl.records.files import write_json
 
@@ -86,24 +86,7 @@ class Supplied(Controller):
         return actions
 
 
-class Schedule(Controller):
-    """The same actions in every copy, whatever happens, shape (steps, entries)."""
-
-    def __init__(self, actions: Floats) -> None:
-        """Take the actions."""
-        self._actions = actions
-
-    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
-        """Begin with the first."""
-        self._env = env
-
-    def act(self, observations: Arrays) -> Arrays:
-        """Return those of the interval."""
-        actions = self._actions[int(self._env.physical.step[0])]
-        return dict(self._env.unstack(np.repeat(actions[:, None], self._env.num_envs, axis=1)))
-
-
-def planned(network: Network, factor: float) -> Schedule:
+def planned(network: Network, factor: float) -> Replay:
     """Return the plan for the expected network from the middle of its starts, if ``factor`` times as much is demanded.
 
     One program for the whole episode, with controls held within intervals, carried out whatever happens.
@@ -120,7 +103,7 @@ def planned(network: Network, factor: float) -> Schedule:
         action = env.stack(planner.act({}))
         actions[step] = action[:, 0]
         env.advance(action)
-    return Schedule(actions)
+    return Replay(actions)
 
 
 def _times(value: Value, factor: float) -> Value:
