@@ -38,9 +38,9 @@ from cirl_marl.controllers import Constant, Controller, Neutral, Random
 from cirl_marl.controllers.rollout import first_seed
 from cirl_marl.evaluation import compare
 from cirl_marl.network.disturbances import BlockBootstrap, DisturbanceEffect, Gaussian, Markov
+from cirl_marl.network.elements import Lifetime
 from cirl_marl.network.innovations import innovations
 from cirl_marl.network.uncertainty import Spread, draw_network, expected_network
-from cirl_marl.network.elements import Lifetime
 from cirl_marl.optimum import NoCertificate, draws, price_fit, uncertain_bound
 from cirl_marl.optimum.draw_proofs import Sampling
 from cirl_marl.optimum.draws import Draw, DrawProgram, DrawProof, Prices
@@ -461,7 +461,7 @@ def merits(network: Network, found: Any, controller: Controller) -> tuple[Floats
 @pytest.mark.medium
 @pytest.mark.parametrize("lifetime", LIVES)
 def test_prices_stand_on_all_that_is_in_use(lifetime: Lifetime) -> None:
-    """With a lifetime the simulator has stages or slots and the program vintages: in no draw does a policy earn more."""
+    """With a lifetime the simulator has stages or slots and the program vintages: no policy earns more in any draw."""
     order = Control(kind=ControlKind.FLOW, low=5.0, neutral=10.0, high=15.0)
     network = town(lifetime, np.full(6, 10.0), initial=40.0)
     buy = Arc(id="buy", donor="mine", recipient="use", law=Law.CONTROLLED, control=order)
