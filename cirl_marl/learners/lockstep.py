@@ -34,6 +34,7 @@ from cirl_marl.learners.barrier import CheckpointBarrier
 from cirl_marl.learners.checkpoint import require_alike
 from cirl_marl.learners.views import BatchedEnv, OneAgent, View
 from cirl_marl.network.declarations import positional_record
+from cirl_marl.network.processes import no_paths
 
 _IN_USE = threading.Lock()
 
@@ -223,8 +224,12 @@ class NetworkWorld(World):
         Raises:
             RunError: if it holds something else than the arrays of this environment.
         """
+        physical = state.get("state") if isinstance(state, Mapping) else None
+        if isinstance(physical, Mapping):  # older ones say nothing of disturbances, of which there were none
+            state = {**state, "state": {"processes": no_paths(), "disturbances": no_paths(), **physical}}
         require_alike(state, self.state_dict(), "the state of the environment")
-        self.env.restore(Snapshot(State(**state["state"]), tuple(state["streams"]), self.env.agents, self.env.network))
+        streams = tuple(state["streams"])
+        self.env.restore(Snapshot(State(**state["state"]), streams, self.env.agents, self.env.network))
         self.env.circularity_weight = state["weight"]
         self.joint_steps, self._returns, self._lengths = state["joint_steps"], state["returns"], state["lengths"]
 
