@@ -35,13 +35,13 @@ FORMS = {
 
 
 def comparison_table(comparison: Comparison) -> Table:
-    """One row a recipe or controller: λ̄, gain, service, bound and gap with 95 % confidence intervals, and its time."""
+    """One row a recipe or controller: λ̄, gain, service, bound and gap with 95 % confidence intervals."""
     rows = []
     for row in comparison.rows:
         seeds = f"{len(row.seeds)} (few)" if row.has_few_seeds else str(len(row.seeds) or "")
         cells = [_interval(row.figure(name), FORMS[name]) for name in comparison.figures]
-        rows.append([row.name, seeds, *cells, f"{_milliseconds(row):.2g}"])
-    headings = ["policy", "seeds", f"λ̄ ({comparison.network.mass_unit})", *_headers(comparison)[1:], "ms a decision"]
+        rows.append([row.name, seeds, *cells])
+    headings = ["policy", "seeds", f"λ̄ ({comparison.network.mass_unit})", *_headers(comparison)[1:]]
     title = f"{comparison.episodes} fresh episodes, the same for all; 95 % confidence intervals in brackets"
     return text_table(title, headings, rows, text=["policy"])
 
@@ -97,6 +97,8 @@ def comparison_notes(comparison: Comparison) -> list[str]:
         notes.append(f"margins, set on other draws: {', '.join(margins)}")
     for name, excess in comparison.misses().items():
         notes.append(f"{name}: its expected service misses what is demanded by {excess:+.4f}")
+    times = ", ".join(f"{row.name} {_milliseconds(row):.2g} ms" for row in comparison.rows)
+    notes.append(f"processor time of a decision: {times}")
     if (expected := comparison.entries[0].uncertain_bound) is not None:
         notes += [str(expected), "gaps: (bound − λ̄ − Σ μ·(service − demand)) of each draw over one scale"]
     if comparison.entries[0].bound is not None:
