@@ -206,6 +206,11 @@ def test_sweeps(count: int, bottles: Network, tmp_path: Path, monkeypatch: pytes
 
     again(done := tmp_path / "done")
     shutil.copytree(done, half := tmp_path / "half")
+    shutil.copytree(done, empty := tmp_path / "empty")
+    for result in some(list(empty.glob("cells/*/result.json"))):
+        result.write_text("{}")
+    with pytest.raises(RunError, match=r"result.json: says nothing of what came of a cell; delete it"):
+        again(empty)
     for result in half.glob("cells/*/result.json"):
         result.unlink()
     for folder in (done, half):

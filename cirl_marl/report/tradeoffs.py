@@ -97,8 +97,9 @@ def comparison_notes(comparison: Comparison) -> list[str]:
         notes.append(f"margins, set on other draws: {', '.join(margins)}")
     for name, excess in comparison.misses().items():
         notes.append(f"{name}: its expected service misses what is demanded by {excess:+.4f}")
-    times = ", ".join(f"{row.name} {_milliseconds(row):.2g} ms" for row in comparison.rows)
-    notes.append(f"processor time of a decision: {times}")
+    times = {row.name: _milliseconds(row) for row in comparison.rows}
+    if slow := [f"{name} {time:.2g} ms" for name, time in times.items() if time >= 1]:
+        notes.append(f"processor time of a decision: {', '.join(slow)}; of others less than 1 ms")
     if (expected := comparison.entries[0].uncertain_bound) is not None:
         notes += [str(expected), "gaps: (bound − λ̄ − Σ μ·(service − demand)) of each draw over one scale"]
     if comparison.entries[0].bound is not None:

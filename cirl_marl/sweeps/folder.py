@@ -154,6 +154,8 @@ OPTION_COLUMNS = tuple(_ENVIRONMENT.get(name, name) for name in SweepOptions.mod
 def _result(file: Path) -> dict[str, Any]:
     """Return what came of a cell; a ``RunError`` if the file is something else."""
     result = read_record(file)
+    if not result:
+        raise RunError(f"{file}: says nothing of what came of a cell; delete it to evaluate anew")
     for name in (*INTERVALS, "unit", "no_bound", "checkpoint"):
         value = result.get(name)
         fits = value is None or (
