@@ -159,7 +159,10 @@ def set_model_state(model: BaseAlgorithm, state: Mapping[str, Any]) -> None:
     model.set_parameters(dict(state["parameters"]), exact_match=True, device=model.device)
     set_variables(model, state["variables"])
     for name, value in state["values"].items():
-        setattr(model, name, _like(getattr(model, name, None), value))
+        now = getattr(model, name, None)
+        if isinstance(now, int | float) and not isinstance(value, int | float):
+            raise RunError(f"{name} is {str(value)[:60]}, no number")
+        setattr(model, name, _like(now, value))
     for noise, values in zip(_noises(model), state["noise"], strict=True):
         for name, value in values.items():
             setattr(noise, name, value)
