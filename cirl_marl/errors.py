@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Sequence
+from numbers import Integral
 
 LONGEST_LINE = 1200
 """Characters of a line of a message; of a longer one, which repeats what is in a file, the middle is left out."""
@@ -62,6 +63,17 @@ class RunError(CirlError):
 
 class LearnerError(RuntimeError):
     """A learner failed while training; names its agent and the joint step."""
+
+
+def whole_number(name: str, value: object, least: int) -> int:
+    """Return a whole number, of Python or NumPy; a ``CirlError`` names one that is none, or below ``least``.
+
+    >>> whole_number("seed", 3, 0)
+    3
+    """
+    if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
+        raise CirlError(f"{name} must be a whole number of at least {least}, got {value!r}")
+    return int(value)
 
 
 def unknown_name(kind: str, name: object, known_names: Iterable[object]) -> str:

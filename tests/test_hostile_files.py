@@ -160,6 +160,26 @@ def test_runs(count: int, unfinished: Path, tmp_path: Path) -> None:
     assert refused or count < 20
 
 
+@pytest.mark.parametrize(
+    "place",
+    [("normaliser", "rewards", "count"), ("normaliser", "returns", "values"), ("buffer", "pos"), ("streams", "torch")],
+    ids=" ".join,
+)
+def test_numbers_of_a_learner(place: Sequence[str], unfinished: Path, tmp_path: Path) -> None:
+    """Something else in the place of a number is refused in the words of the file, before anything is written."""
+    shutil.copytree(unfinished, copied := tmp_path / "altered")
+    file = RunDirectory(copied).checkpoint / "use.state.json"
+    state = json.loads(file.read_text())
+    parent = state
+    for key in place[:-1]:
+        parent = parent[key]
+    parent[place[-1]] = {"x": 1}
+    file.write_text(json.dumps(state))
+    with pytest.raises(RunError, match=r"use\.state"):
+        resume(copied)
+    assert file.exists()
+
+
 @COUNTS
 def test_teams(count: int, tmp_path: Path) -> None:
     """Teams of environments of others."""

@@ -497,12 +497,18 @@ def bad_teams() -> Iterator[tuple[Any, type[Exception], str]]:
     yield lambda: cirl_marl.independent(make, partial(PPO, "NoPolicy")), RecipeError, r"agent 'early': .*NoPolicy"
     yield lambda: cirl_marl.independent(make, dict), RecipeError, r"agent 'early': .*'dict'"  # type: ignore[arg-type]
     yield lambda: cirl_marl.independent(make, PPO, num_envs=0), CirlError, r"num_envs must be"
+    yield lambda: cirl_marl.independent(make, PPO, seed=-1), CirlError, r"seed must be"
+    yield lambda: cirl_marl.independent(make, PPO).evaluate(seed=True), CirlError, r"seed must be"
     yield lambda: cirl_marl.independent(lambda: short("CartPole-v1"), PPO), CirlError, r"PettingZoo ParallelEnv"
     yield lambda: cirl_marl.independent(lambda: Shifts({}, 7), PPO), CirlError, r"has no possible_agents"
     nested = spaces.Dict({"a": spaces.Dict({"b": spaces.Discrete(2)})})
     yield lambda: cirl_marl.independent(lambda: Shifts(PAIR, 7, seen=nested), PPO), CirlError, r"agent 'early'.*Dict"
     yield lambda: cirl_marl.independent(make, PPO)["erly"], CirlError, r"'erly'.*'early'"
-    yield lambda: cirl_marl.independent(make, PPO).learn(0), CirlError, r"total_timesteps must be at least 1"
+    yield (
+        lambda: cirl_marl.independent(make, PPO).learn(0),
+        CirlError,
+        r"total_timesteps .* at least 1",
+    )
 
 
 @pytest.mark.parametrize(("make", "kind", "said"), [*bad_teams()])

@@ -22,7 +22,7 @@ from cirl_marl.environments.observations import ObservationLayout
 from cirl_marl.environments.rewards import Credit, Scoring
 from cirl_marl.environments.starts import Starts
 from cirl_marl.environments.state import Interval, Outcome, Snapshot, State
-from cirl_marl.errors import CirlError, ControlError, unknown_name
+from cirl_marl.errors import CirlError, ControlError, unknown_name, whole_number
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.calendar import years
 from cirl_marl.network.elements import MOMENTS, REWARDS
@@ -116,9 +116,7 @@ class MultiAgentVectorEnv:
         variant = definition.scenario(scenario)
         default = variant.episode.horizon
         for name, value in (("num_envs", num_envs), ("horizon", default if horizon is None else horizon)):
-            if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
-                raise CirlError(f"{name} must be a whole number of at least 1, got {value!r}")
-            if value > MOST:
+            if whole_number(name, value, 1) > MOST:
                 raise CirlError(f"{name} must be at most {MOST:,}, got {value:,}: no memory holds as many")
         if horizon is not None:
             variant = variant.with_options(episode={"horizon": horizon})

@@ -27,7 +27,16 @@ from cirl_marl.records.files import read_json
 
 KIND = "__kind__"
 """Key that says what a table stands for, if it is no table."""
-UNREADABLE = (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError, SafetensorError)
+UNREADABLE = (
+    OSError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    RecursionError,
+    OverflowError,
+    SafetensorError,
+)
 """What damaged files, or those of something else, raise."""
 
 
@@ -87,7 +96,7 @@ def require_alike(value: Any, template: Any, place: str) -> None:
     elif isinstance(template, np.ndarray):
         if not isinstance(value, np.ndarray) or (value.dtype, value.shape) != (template.dtype, template.shape):
             raise RunError(f"{place} is no array of {template.dtype}, shape {template.shape}")
-    elif isinstance(value, bool) or not isinstance(
+    elif isinstance(value, bool) != isinstance(template, bool) or not isinstance(
         value, (float, int) if isinstance(template, float) else type(template)
     ):
         raise RunError(f"{place} is {str(value)[:60]}, not of type {type(template).__name__}")
@@ -165,6 +174,8 @@ def set_model_state(model: BaseAlgorithm, state: Mapping[str, Any]) -> None:
         setattr(model, name, _like(now, value))
     for noise, values in zip(_noises(model), state["noise"], strict=True):
         for name, value in values.items():
+            if np.shape(value) != np.shape(getattr(noise, name)):
+                raise RunError(f"{name} has shape {np.shape(value)}, not {np.shape(getattr(noise, name))}")
             setattr(noise, name, value)
     for explorer, matrices in zip(_explorers(model), state["matrices"], strict=True):
         for name, value in matrices.items():
@@ -201,6 +212,7 @@ def set_buffer_state(buffer: ReplayBuffer, state: Mapping[str, Any]) -> None:
                     raise ValueError(f"holds what another learner saw: {name} of shape {part.shape}, not {into.shape}")
                 into[: len(part)] = part
             else:
+                require_alike(part, into, name)
                 setattr(buffer, name, part)
 
 
@@ -233,9 +245,12 @@ def set_normaliser_state(env: VecNormalize, state: Mapping[str, Any], *, returns
             raise RunError(f"is for {mean.size} entries, not {np.size(statistics.mean)}")
         if var.shape != mean.shape or not (np.isfinite(mean) & np.isfinite(var) & (var >= 0)).all():
             raise RunError("has moments that are none: means and variances must be finite, variances not negative")
+        require_alike(moments["count"], float(statistics.count), "count")
         statistics.mean, statistics.var, statistics.count = mean, var, moments["count"]
     if returns:
-        env.returns = _array(state["returns"])
+        if np.shape(now := _array(state["returns"])) != env.returns.shape:
+            raise RunError(f"has returns of shape {now.shape}, not {env.returns.shape}")
+        env.returns = now
 
 
 class FrozenStatistics(RunningMeanStd):

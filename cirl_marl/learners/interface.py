@@ -19,7 +19,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.definitions.reader import write_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, RecipeError, RunError, unknown_name
+from cirl_marl.errors import CirlError, RecipeError, RunError, unknown_name, whole_number
 from cirl_marl.learners.agent_env import AgentVecEnv
 from cirl_marl.learners.algorithms import has_replay_buffer
 from cirl_marl.learners.learner import Learner, load_acting_learner
@@ -145,7 +145,7 @@ def prepare(
 ) -> Training:
     """Return the training that ``train`` would start with these arguments; nothing is trained and nothing written."""
     full_recipe = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
-    steps = full_recipe.run.steps if steps is None else _whole("steps", steps, 1)
+    steps = full_recipe.run.steps if steps is None else whole_number("steps", steps, 1)
     if engine is not None and engine not in ENGINES:
         raise CirlError(unknown_name("engine", engine, ENGINES))
     if min_service is not None and not 0 <= min_service <= 1:
@@ -156,14 +156,14 @@ def prepare(
     full_recipe.check(steps)
     overrides = {n: v.item() if isinstance(v, np.generic) else v for n, v in options.items() if v is not None}
     settings = full_recipe.environment | overrides
-    copies = full_recipe.run.envs if envs is None else _whole("envs", envs, 1)
+    copies = full_recipe.run.envs if envs is None else whole_number("envs", envs, 1)
     env = MultiAgentVectorEnv(network, num_envs=copies, agents=agents, **settings)
     if not env.agents:
         raise CirlError(f"network '{env.network.name}': no compartment has a control, so nothing can learn")
     full_recipe.check_agents(env.agents)
     settings.pop("scenario", None)
     task: dict[str, Any] = {"network": env.network.name, "scenario": env.network.scenario_name, "agents": env.agents}
-    task |= {"recipe": full_recipe, "seed": _whole("seed", seed, 0), "steps": steps, "envs": copies}
+    task |= {"recipe": full_recipe, "seed": whole_number("seed", seed, 0), "steps": steps, "envs": copies}
     config = RunConfig(**task, options=settings)
     if checkpoint_every is not None and not checkpoint_every >= 0:
         raise CirlError(f"checkpoint_every must be seconds of at least 0, got {checkpoint_every!r}")
@@ -241,7 +241,7 @@ def _config_to_go_on(run: RunDirectory, config: RunConfig, steps: int | None) ->
     status = run.status
     done, complete = status["joint_steps"] * config.envs, status["state"] == "complete"
     if steps is not None:
-        config = config.model_copy(update={"steps": _whole("steps", steps, done + 1)})
+        config = config.model_copy(update={"steps": whole_number("steps", steps, done + 1)})
         config.recipe.check(config.steps)
     elif complete:
         raise RunError(f"{run.path}: the run is complete ({done:,} environment steps); give more steps to go on")
@@ -281,12 +281,6 @@ def _check_options(options: Iterable[str], *functions: Callable[..., object]) ->
     for option in options:
         if option not in names:
             raise CirlError(unknown_name("option", option, names))
-
-
-def _whole(name: str, value: object, least: int) -> int:
-    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
-        raise CirlError(f"{name} must be a whole number of at least {least}, got {value!r}")
-    return int(value)
 
 
 def complete_run(

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from scipy import sparse
 
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.errors import CirlError
+from cirl_marl.errors import CirlError, whole_number
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import frozen_record, positional_record
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
@@ -267,8 +267,7 @@ def envelope(
     as (episodes, 1); ``solves``, how many programs to solve, at most 1 + episodes; and ``progress``, called with the
     number of those that are solved.
     """
-    if not isinstance(solves, int | np.integer) or isinstance(solves, bool) or solves < 1:
-        raise CirlError(f"solves must be a whole number of at least 1, got {solves!r}")
+    whole_number("solves", solves, 1)
     admissible = Admissible.of(_episode_network(network, scenario, horizon), agents)
     lifetimes = admissible.lifetimes
     if np.ndim(initial) != 2 or not len(np.asarray(initial)):

@@ -27,7 +27,7 @@ from cirl_marl.controllers.basic import Constant, Controller, Neutral
 from cirl_marl.controllers.rollout import EVALUATION_SEEDS
 from cirl_marl.controllers.scripted import ScriptController
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError
+from cirl_marl.errors import CirlError, whole_number
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import frozen_record
 from cirl_marl.network.uncertainty import expected_network
@@ -154,8 +154,7 @@ def search_each(
     """
     check_options(service_weight, min_service, DEGREE)
     for name, value, least in (("population", population, 8), ("iterations", iterations, 0), ("knots", knots, 1)):
-        if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
-            raise CirlError(f"{name} must be a whole number of at least {least}, got {value!r}")
+        whole_number(name, value, least)
     if knots > network.episode.horizon:
         raise CirlError(f"knots: {knots} are more than the {network.episode.horizon} decisions of an episode")
     network = expected_network(network)

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 
 from cirl_marl.controllers.basic import Arrays, Planner
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, ControlError
+from cirl_marl.errors import CirlError, ControlError, whole_number
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.innovations import innovations
@@ -124,10 +124,8 @@ class MPC(Planner):
         if prices is not None and (horizon, futures) != (None, None):
             raise CirlError("prices are for plans of a single interval; leave out horizon and futures")
         for name, value in (("replan", replan), ("horizon", horizon), ("futures", futures)):
-            if value is None:
-                continue
-            if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
-                raise CirlError(f"{name} must be a whole number of at least 1, got {value!r}")
+            if value is not None:
+                whole_number(name, value, 1)
         if horizon is not None and horizon < (replan or 1):
             raise CirlError(f"horizon {horizon} is shorter than the {replan} decisions carried out of each plan")
         self._options = horizon, replan, futures

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cirl_marl.dynamics.state_layout import StateLayout
-from cirl_marl.errors import CirlError, unknown_name
+from cirl_marl.errors import CirlError, unknown_name, whole_number
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.initial_ages import age_shares
 from cirl_marl.network.series import Series, Value
@@ -55,8 +55,7 @@ def check_options(service_weight: float | None, min_service: ArrayLike | None, d
         raise CirlError(f"service_weight {service_weight!r} must be finite and not negative")
     if min_service is not None:
         check_service(min_service)
-    if not isinstance(degree, int | np.integer) or isinstance(degree, bool) or degree < 1:
-        raise CirlError(f"degree must be a whole number of at least 1, got {degree!r}")
+    whole_number("degree", degree, 1)
 
 
 def by_stage(network: Network, state_layout: StateLayout, stocks: ArrayLike) -> Floats:

@@ -20,7 +20,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.preprocessing import is_image_space
 
-from cirl_marl.errors import CirlError, RecipeError, RunError, unknown_name
+from cirl_marl.errors import CirlError, RecipeError, RunError, unknown_name, whole_number
 from cirl_marl.learners.algorithms import RESERVED_PARAMETERS, every_algorithm
 from cirl_marl.learners.checkpoint import read_tree, write_tree
 from cirl_marl.learners.learner import TENSORBOARD_ADVICE, Learner, derived_seed, has_tensorboard, predict_action
@@ -61,9 +61,7 @@ def independent(
         CirlError: for a pattern that fits nobody, an algorithm or parameter that there is not, a space that the
             algorithm cannot take, or something else than an environment.
     """
-    if not isinstance(num_envs, int) or num_envs < 1:
-        raise CirlError(f"num_envs must be a whole number of at least 1, got {num_envs!r}")
-    copies = Copies(make_env, num_envs)
+    copies = Copies(make_env, whole_number("num_envs", num_envs, 1))
     settings = {}
     for pattern in overrides or {}:
         if not any(fnmatchcase(agent, pattern) for agent in copies.agents):
@@ -71,7 +69,7 @@ def independent(
     for agent in copies.agents:
         fit = (kind for pattern, kind in (overrides or {}).items() if fnmatchcase(agent, pattern))
         settings[agent] = _settings(agent, next(fit, algorithm), copies.observation_spaces[agent], normalise)
-    return Team(make_env, copies, settings, seed, tensorboard_log)
+    return Team(make_env, copies, settings, whole_number("seed", seed, 0), tensorboard_log)
 
 
 class Team:
@@ -134,8 +132,7 @@ class Team:
         Raises:
             LearnerError: if a learner fails, or the environment tells of others than it promised.
         """
-        if total_timesteps < 1:
-            raise CirlError(f"total_timesteps must be at least 1, got {total_timesteps}")
+        whole_number("total_timesteps", total_timesteps, 1)
         for agent in callbacks or {}:
             if agent not in self.learners:
                 raise CirlError(f"callbacks: {unknown_name('agent', agent, self.agents)}")
@@ -173,8 +170,8 @@ class Team:
             seed: from which theirs derive.
             deterministic: whether policies do what they think best, or draw.
         """
-        if episodes < 1:
-            raise CirlError(f"episodes must be at least 1, got {episodes}")
+        whole_number("episodes", episodes, 1)
+        whole_number("seed", seed, 0)
         with (
             closing(Copies(self._make_env, min(episodes, self._copies.num_envs))) as copies,
             Streams(derived_seed(seed, "evaluation")).active(),
@@ -252,8 +249,8 @@ class Team:
         state = read_tree(path, "team")
         try:
             settings = {agent: LearnerSettings.model_validate(spec) for agent, spec in state["agents"].items()}
-            copies = Copies(make_env, state["num_envs"])
-            seed = int(state["seed"])
+            copies = Copies(make_env, whole_number("num_envs", state["num_envs"], 1))
+            seed = whole_number("seed", state["seed"], 0)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise RunError(f"{path / 'team.json'}: is not what a team wrote: {error}") from error
         if set(settings) != set(copies.agents):
