@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -215,6 +217,12 @@ def test_policies_have_aims_too(copper_run: Path, tmp_path: Path) -> None:
     assert (found.low <= found.centre + 1e-9).all() and (found.centre <= found.high + 1e-9).all()
     path = write_weights(found, tmp_path / "aims.csv")
     assert len(path.read_text().splitlines()) == 1 + len(found.terms)
+    shutil.copytree(copper_run, weighted := tmp_path / "weighted")
+    config = json.loads((weighted / "config.json").read_text())
+    config["recipe"]["environment"]["circularity_weight"] = 0.87  # how it was paid, not what it did
+    (weighted / "config.json").write_text(json.dumps(config))
+    same = infer("copper_net", weighted, episodes=2, kinds=["circularity", "services"])
+    np.testing.assert_array_equal(same.centre, found.centre)
     with pytest.raises(RunError, match="was trained on 'copper_net'"):
         infer("carbo_net", copper_run)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -79,7 +80,9 @@ def episode_setting(network: Network, plans: Sequence[object]) -> tuple[Network,
 
 
 def _parts(network: Network) -> tuple[object, ...]:
-    return network.nodes, network.arcs, network.services, network.objective, network.episode.control_interval
+    """Return what plans are of: all but how learners were paid, which a recipe may choose."""
+    objective = replace(network.objective, circularity_weight=0.5)
+    return network.nodes, network.arcs, network.services, objective, network.episode.control_interval
 
 
 class _Table:
