@@ -52,6 +52,11 @@ def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str
     return "\n".join([head, "|" + "-|" * len(columns), *body])
 
 
+def measured_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Write a table in Markdown, and below it what it was made with."""
+    return f"{markdown_table(columns, rows)}\n\n{made_with()}"
+
+
 def made_with() -> str:
     """Return a line with the versions that figures depend on."""
     found = ", ".join(f"{name} {version}" for name, version in versions().items())

@@ -16,8 +16,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks.document import made_with, markdown_table, write_sections
-from benchmarks.uncertain import DEMANDED, WORLDS, World, contenders
+from benchmarks.document import measured_table, write_sections
+from benchmarks.uncertain import DEMANDED, WORLDS, World, contenders, entries
 from benchmarks.uncertain import RESULTS as KNOBS
 from cirl_marl import MultiAgentVectorEnv, bound, load_network
 from cirl_marl.controllers.rollout import first_seed, rollout
@@ -66,24 +66,12 @@ def _gaps(world: World, found: UncertainBound) -> Iterator[tuple[str, Any]]:
 
 def table(results: Mapping[str, Any]) -> str:
     """Return what was measured as a table, and what it was made with."""
-    columns = (
-        "world",
-        "bound, + 95 %",
-        "perfect information",
-        "closed",
-        "neutral",
-        "plan",
-        "rule",
-        "draws",
-    )
-    return "\n".join([markdown_table(columns, _rows(results)), "", made_with()])
+    columns = ("world", "bound, + 95 %", "perfect information", "closed", "neutral", "plan", "rule", "draws")
+    return measured_table(columns, _rows(results))
 
 
 def _rows(results: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
-    for world in WORLDS:
-        if world.network not in results:
-            continue
-        entry = results[world.network]
+    for world, entry in entries(results):
         gaps = {name: figures["gap"] for name, figures in entry["contenders"].items()}
         best = min(figures["foresight_gap"]["value"] for figures in entry["contenders"].values())
         closed = (entry["perfect_information"] - entry["bound"]) / abs(entry["bound"]) / best

@@ -21,7 +21,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from benchmarks.document import made_with, markdown_table, write_sections
+from benchmarks.document import measured_table, write_sections
 from cirl_marl import MultiAgentVectorEnv, Network, load_network
 from cirl_marl.controllers import Controller, Neutral, ScriptController
 from cirl_marl.controllers.basic import Arrays
@@ -180,14 +180,16 @@ def is_met(figures: Mapping[str, Any]) -> bool:
 def table(results: Mapping[str, Any]) -> str:
     """Return what was measured as a table, and what it was made with."""
     columns = ("world", "who acts", "λ̄", "of the 5 % worst", "lowest service", "of the 5 % worst", "knob")
-    return "\n".join([markdown_table(columns, _rows(results)), "", made_with()])
+    return measured_table(columns, _rows(results))
+
+
+def entries(results: Mapping[str, Any]) -> Iterator[tuple[World, Any]]:
+    """Yield each world that was measured, and what came out."""
+    return ((world, results[world.network]) for world in WORLDS if world.network in results)
 
 
 def _rows(results: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
-    for world in WORLDS:
-        if world.network not in results:
-            continue
-        entry = results[world.network]
+    for world, entry in entries(results):
         for name, figures in entry["contenders"].items():
             service = min(figures["levels"].items(), key=lambda item: float(item[1]["value"]))[0]
             place = f"`{world.network}`, {entry['scenario']}, {entry['unit']}" if name == "neutral" else ""

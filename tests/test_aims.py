@@ -235,7 +235,7 @@ def test_policies_have_aims_too(copper_run: Path, tmp_path: Path) -> None:
         ("none.csv", {"within": 1.5}, "within 1.5 must be at least 0"),
         ("none.csv", {"kinds": ["service"]}, "unknown kind 'service'. Did you mean 'services'"),
         ("none.csv", {"kinds": ["services"]}, "nothing to weigh: of services it has 1 term"),
-        ("none.csv", {"episodes": 0}, "episodes must be at least 1"),
+        ("none.csv", {"episodes": 0}, "episodes must be a whole number of at least 1"),
     ],
 )
 def test_bad_questions(plans: Any, options: dict[str, Any], said: str) -> None:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import typer
 from some import some
 
-from benchmarks import paper, study
+from benchmarks import foresight, paper, study, uncertain
 from cirl_marl import load_network
 from cirl_marl.controllers.lqr import LinearSystem
 from cirl_marl.jobs import run_jobs
@@ -85,6 +87,14 @@ def test_rows_of_the_paper_are_planned_once_and_failures_are_told(
     paper.main(out=tmp_path / "new", only=["CopperNet"], table=True)
     assert (tmp_path / "new" / "paper_tables.md").is_file()
     assert paper.DOCUMENT.read_bytes() == published
+
+
+@pytest.mark.parametrize("benchmark", [uncertain, foresight], ids=lambda module: module.RESULTS.stem)
+def test_tables_of_worlds_are_those_of_kept_results(benchmark: ModuleType) -> None:
+    """The figures in the document are what was measured, row by row."""
+    table = benchmark.table(json.loads(benchmark.RESULTS.read_text()))
+    rows = [line for line in table.splitlines() if line.startswith("|")]
+    assert len(rows) > 2 and "\n".join(rows) in benchmark.DOCUMENT.read_text(encoding="utf-8")
 
 
 def test_kept_results_name_no_machine() -> None:

@@ -205,7 +205,7 @@ def is_alive(process: int) -> bool:
     [
         ({"on": "locl"}, r"unknown place 'locl'. Did you mean 'local'\? Known: here, local, slurm, ray."),
         ({"on": "here", "workers": 2}, "there is one worker, not 2; use --on local"),
-        ({"on": "local", "workers": 0}, "workers must be at least 1, got 0"),
+        ({"on": "local", "workers": 0}, "workers must be a whole number of at least 1, got 0"),
         (
             {"on": "local", "settings": {"slurm_partition": "long"}},
             "--slurm slurm_partition=long: goes with --on slurm",

@@ -144,7 +144,7 @@ def test_late_levers_share_a_row(tmp_path: Path) -> None:
     assert cirl_marl.draw(tmp_path / "levers.png", result).stat().st_size > 10_000
     assert isinstance(result.rows[0], LeverRow)
     assert "2 others" in cirl_marl.summarise(result).columns[0]._cells  # type: ignore[union-attr]
-    with pytest.raises(CirlError, match="most must be at least 2, got 1"):
+    with pytest.raises(CirlError, match="most must be a whole number of at least 2, got 1"):
         cirl_marl.levers(heaps(), most=1)
 
 

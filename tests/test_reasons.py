@@ -251,7 +251,7 @@ def test_bad_questions_about_a_network(options: dict[str, Any], said: str) -> No
 
 def test_bad_questions_about_a_run(copper_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Too few episodes, a scenario, and an extra that is missing."""
-    with pytest.raises(CirlError, match="episodes must be at least 2"):
+    with pytest.raises(CirlError, match="episodes must be a whole number of at least 2"):
         explain(copper_run, episodes=1)
     with pytest.raises(CirlError, match="a run has its own"):
         explain(copper_run, scenario="paper")

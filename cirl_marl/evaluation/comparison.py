@@ -14,7 +14,7 @@ from cirl_marl.controllers.basic import Controller
 from cirl_marl.controllers.rollout import Rollout, first_seed, rollout
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError
+from cirl_marl.errors import CirlError, whole_number
 from cirl_marl.evaluation.baselines import Baseline, bounds_of_draws, solve_baseline
 from cirl_marl.evaluation.calibration import CLOSE, Calibration, calibrate
 from cirl_marl.evaluation.contenders import Contender, contenders
@@ -226,8 +226,8 @@ def compare(
         CirlError: for input that cannot be used, a controller that does not fit the network, or a solver that fails.
         RunError: if a run is incomplete, or of another environment.
     """
-    if episodes is not None and episodes < 2:
-        raise CirlError(f"episodes must be at least 2 for a confidence interval, got {episodes}")
+    if episodes is not None:
+        whole_number("episodes", episodes, 2)  # of fewer there is no confidence interval
     if network is None and scenario is not None:
         raise CirlError(f"scenario '{scenario}' goes with a network; runs have their own")
     definition = load_network(network) if isinstance(network, str | Path) else network

@@ -16,7 +16,7 @@ from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, unknown_name
+from cirl_marl.errors import CirlError, unknown_name, whole_number
 from cirl_marl.evaluation.comparison import ProgressReport, part_of
 from cirl_marl.network import Network
 from cirl_marl.network.declarations import positional_record
@@ -139,8 +139,7 @@ def levers(
     """
     variant = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
     by_lever = _agents_by_lever(variant, groups or {})
-    if most < 2:
-        raise CirlError(f"most must be at least 2, got {most}")
+    whole_number("most", most, 2)
     usual = _as_usual(variant)
     demand = np.maximum(usual.episode_levels[0] - ROUNDING, 0.0) if min_service is None else min_service
     agents = {agent for group in by_lever.values() for agent in group}

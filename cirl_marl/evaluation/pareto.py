@@ -12,7 +12,7 @@ import numpy as np
 
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, RunError
+from cirl_marl.errors import CirlError, RunError, whole_number
 from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.baselines import FRONT
 from cirl_marl.evaluation.comparison import ProgressReport, part_of
@@ -104,8 +104,8 @@ def pareto_front(
         RunError: if ``directory`` holds the runs of something else, or a training fails elsewhere.
     """
     check_place(on, workers)
-    if points < 2 or seeds < 1:
-        raise CirlError(f"points must be at least 2 and seeds at least 1, got {points} and {seeds}")
+    whole_number("points", points, 2)
+    whole_number("seeds", seeds, 1)
     definition = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
     recipe_ = _without_service_price(load_recipe(recipe) if isinstance(recipe, str | Path) else recipe)
     if recipe_ is not None:

@@ -13,7 +13,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, Protocol
 
-from cirl_marl.errors import CirlError, unknown_name
+from cirl_marl.errors import CirlError, unknown_name, whole_number
 from cirl_marl.jobs.slurm import Slurm, sbatch_options, settings_text
 from cirl_marl.jobs.work import Work, text_lines
 
@@ -200,8 +200,8 @@ def check_place(on: str, workers: int | None = None, settings: Mapping[str, str]
         raise CirlError(unknown_name("place", on, PLACES))
     if settings and on != "slurm":
         raise CirlError(f"{settings_text(settings)}: goes with --on slurm, not with --on {on}")
-    if workers is not None and workers < 1:
-        raise CirlError(f"workers must be at least 1, got {workers}")
+    if workers is not None:
+        whole_number("workers", workers, 1)
     if on == "here" and workers not in (None, 1):
         raise CirlError(f"in this process there is one worker, not {workers}; use --on local")
     if on == "slurm":

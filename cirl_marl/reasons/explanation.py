@@ -12,7 +12,7 @@ import numpy as np
 
 from cirl_marl.controllers.rollout import first_seed, rollout
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.errors import CirlError, unknown_name
+from cirl_marl.errors import CirlError, unknown_name, whole_number
 from cirl_marl.evaluation.baselines import levels_to_demand
 from cirl_marl.evaluation.comparison import part_of, starting_stocks
 from cirl_marl.learners.run_directory import RunDirectory
@@ -103,10 +103,8 @@ def explain(
         return Explanation(network=network, about=network.name, prices=prices, state_prices=by_state)
     if scenario is not None:
         raise CirlError(f"scenario '{scenario}' goes with a network; a run has its own")
-    if episodes < 2:
-        raise CirlError(f"episodes must be at least 2 for a confidence interval, got {episodes}")
-    if top < 1 or leaves < 2:
-        raise CirlError(f"top must be at least 1 and leaves at least 2, got {top} and {leaves}")
+    for name, value, least in (("episodes", episodes, 2), ("top", top, 1), ("leaves", leaves, 2)):
+        whole_number(name, value, least)
     parts = possible if parts is None else tuple(parts)
     for part in extras.MODULES:
         if part in parts:

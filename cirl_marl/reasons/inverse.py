@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import linprog
 
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.errors import CirlError
+from cirl_marl.errors import CirlError, whole_number
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import frozen_record
 from cirl_marl.optimum.admissible import Admissible
@@ -156,8 +156,7 @@ def infer(
     """
     if not 0 <= within < 1:
         raise CirlError(f"within {within!r} must be at least 0 and less than 1")
-    if episodes < 1:
-        raise CirlError(f"episodes must be at least 1, got {episodes}")
+    whole_number("episodes", episodes, 1)
     stop = time.process_time() + seconds
     network = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
     sources = [plans] if isinstance(plans, str | Path | PlannedEpisode) else list(plans)
