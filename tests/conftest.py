@@ -374,3 +374,9 @@ st.register_type_strategy(
         lifetimes=st.sampled_from([False, False, True]),
     ),
 )
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run a test in an empty folder."""
+    monkeypatch.chdir(tmp_path)
