@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from disturbed_line import line
 from numpy.typing import NDArray
 from scipy import optimize, sparse
 from small_networks import CORRELATION, KINDS
-from test_disturbances import line
 from test_lifetimes import LIVES, town
 from test_optimum import certifiable
 

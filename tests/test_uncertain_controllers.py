@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from disturbed_line import EVERYWHERE, line
 from numpy.typing import NDArray
 from small_networks import KINDS
-from test_disturbances import EVERYWHERE, line
 from test_mpc import ORDER, in_use
 from test_optimum import certifiable
 from test_uncertain_bound import DEMAND, Paths, stockist, works
