@@ -20,12 +20,14 @@ import pytest
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 from some import some
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO, TD3
+from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 
 import cirl_marl
 from cirl_marl import CirlError, LearnerError, RunError, Team
 from cirl_marl.evaluation.assessment import evaluate
 from cirl_marl.jobs.work import JobFiles
+from cirl_marl.learners.checkpoint import model_state, set_model_state
 from cirl_marl.learners.interface import Trained, resume, train
 from cirl_marl.learners.recipe import Recipe
 from cirl_marl.learners.run_directory import RunDirectory
@@ -178,6 +180,19 @@ def test_numbers_of_a_learner(place: Sequence[str], unfinished: Path, tmp_path: 
     with pytest.raises(RunError, match=r"use\.state"):
         resume(copied)
     assert file.exists()
+
+
+def test_noise_of_another_learner_is_refused() -> None:
+    """What draws the noise of actions goes on from what it drew last, of the same shape."""
+    noise = OrnsteinUhlenbeckActionNoise(np.zeros(1), np.ones(1))
+    model = TD3("MlpPolicy", "Pendulum-v1", action_noise=noise, buffer_size=1, policy_kwargs={"net_arch": [4]})
+    state = model_state(model)
+    assert noise().any()
+    set_model_state(model, state)
+    assert not noise.noise_prev.any()
+    state["noise"][0]["noise_prev"] = np.zeros(2)
+    with pytest.raises(RunError, match=r"noise_prev has shape \(2,\), not \(1,\)"):
+        set_model_state(model, state)
 
 
 @COUNTS
