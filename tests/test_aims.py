@@ -219,7 +219,7 @@ def test_policies_have_aims_too(copper_run: Path, tmp_path: Path) -> None:
     assert len(path.read_text().splitlines()) == 1 + len(found.terms)
     shutil.copytree(copper_run, weighted := tmp_path / "weighted")
     config = json.loads((weighted / "config.json").read_text())
-    config["recipe"]["environment"]["circularity_weight"] = 0.87  # how it was paid, not what it did
+    config["options"]["circularity_weight"] = 0.87  # how it was paid, not what it did
     (weighted / "config.json").write_text(json.dumps(config))
     same = infer("copper_net", weighted, episodes=2, kinds=["circularity", "services"])
     np.testing.assert_array_equal(same.centre, found.centre)

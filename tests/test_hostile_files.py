@@ -163,11 +163,18 @@ def test_runs(count: int, unfinished: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "place",
-    [("normaliser", "rewards", "count"), ("normaliser", "returns", "values"), ("buffer", "pos"), ("streams", "torch")],
-    ids=" ".join,
+    ("place", "value", "said"),
+    [
+        (("normaliser", "rewards", "count"), {"x": 1}, "count is .* not of type float"),
+        (("normaliser", "returns", "values"), [0.0], r"returns of shape \(1,\), not \(2,\)"),
+        (("buffer", "pos"), "x", "pos is .* not of type int"),
+        (("buffer", "full"), 1, "full is 1, not of type bool"),
+        (("model", "values", "_n_updates"), {"x": 1}, "_n_updates is .* no number"),
+        (("model", "action_stream", "uinteger"), 10**30, "too large"),
+        (("streams", "torch"), {"x": 1}, "cannot be read"),
+    ],
 )
-def test_numbers_of_a_learner(place: Sequence[str], unfinished: Path, tmp_path: Path) -> None:
+def test_numbers_of_a_learner(place: Sequence[str], value: object, said: str, unfinished: Path, tmp_path: Path) -> None:
     """Something else in the place of a number is refused in the words of the file, before anything is written."""
     shutil.copytree(unfinished, copied := tmp_path / "altered")
     file = RunDirectory(copied).checkpoint / "use.state.json"
@@ -175,9 +182,9 @@ def test_numbers_of_a_learner(place: Sequence[str], unfinished: Path, tmp_path: 
     parent = state
     for key in place[:-1]:
         parent = parent[key]
-    parent[place[-1]] = {"x": 1}
+    parent[place[-1]] = value
     file.write_text(json.dumps(state))
-    with pytest.raises(RunError, match=r"use\.state"):
+    with pytest.raises(RunError, match=rf"use\.state.*{said}"):
         resume(copied)
     assert file.exists()
 
@@ -206,6 +213,11 @@ def test_teams(count: int, tmp_path: Path) -> None:
         "learn": lambda path: Team.load(path, Walk).learn(16),
     }
     assert use_altered(tmp_path / "team", uses, tmp_path, count) or count < 20
+    written = json.loads((tmp_path / "team" / "team.json").read_text())
+    shutil.copytree(tmp_path / "team", tmp_path / "unseeded")
+    (tmp_path / "unseeded" / "team.json").write_text(json.dumps({**written, "seed": -1}))
+    with pytest.raises(RunError, match="seed must be a whole number of at least 0, got -1"):
+        Team.load(tmp_path / "unseeded", Walk)
     (tmp_path / "outside").mkdir()
     (tmp_path / "team" / "one.json").rename(tmp_path / "outside" / "one.json")
     (tmp_path / "team" / "one.json").symlink_to(tmp_path / "outside" / "one.json")

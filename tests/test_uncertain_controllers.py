@@ -26,6 +26,7 @@ from cirl_marl.optimum import NoCertificate, Sampling, mpc, simulate_plan
 from cirl_marl.optimum.blind import BestConstant, BestSchedule, Replay
 from cirl_marl.optimum.mpc import MPC, future_noise
 from cirl_marl.optimum.registry import named_controller
+from cirl_marl.report.tradeoffs import comparison_notes
 
 Floats = NDArray[np.float64]
 
@@ -256,6 +257,9 @@ def test_all_are_compared_by_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
         assert entry.milliseconds > (1.0 if row.name.endswith(("mpc", "policy")) else 0.0)
         excess = float(entry.rollout.episode_levels.mean() - 0.8)
         assert (row.name in comparison.misses()) == (abs(excess) > calibration.CLOSE and entry.calibration is not None)
+    (note,) = (note for note in comparison_notes(comparison) if note.startswith("processor time of a decision"))
+    noticeable = {row.name for row in comparison.rows if row.entries[0].milliseconds >= 1}
+    assert {"scenario_mpc", "price_policy"} <= noticeable == {name for name in gaps if f"{name} " in note}
     with pytest.raises(CirlError, match="tune: give min_service"):
         compare((), names[:1], network=found.network, bounds=False, tune=10)
 
