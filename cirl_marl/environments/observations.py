@@ -236,17 +236,15 @@ class ObservationLayout:
         yield from self._inner.get(agent, ())
         if agent in self._load:
             yield self._load[agent]
-        if not isinstance(compartment, Arc):
-            arcs, neighbours = self._incident[position], self._across(position)
-        else:
-            ends = [network.node_index[compartment.donor], network.node_index[compartment.recipient]]
-            yield from ends
-            arcs = [k for end in ends for k in self._incident[end]] if mode == "neighbours" else []
-            neighbours = [node for end in ends for node in self._across(end)]
+        is_arc, near = isinstance(compartment, Arc), [position]
+        if isinstance(compartment, Arc):
+            near = [network.node_index[compartment.donor], network.node_index[compartment.recipient]]
+            yield from near
+        arcs = [] if is_arc and mode != "neighbours" else [k for node in near for k in self._incident[node]]
         yield from (signals.flows.start + k for k in arcs)
         yield from (self._load[network.arcs[k].id] for k in arcs if network.arcs[k].id in self._load)
         if mode == "neighbours":
-            yield from neighbours
+            yield from (node for centre in near for node in self._across(centre))
         if mode == "full":
             yield from (row for row in range(signals.quantities) if row not in self._unobservable)
         if compartment.set_point is not None:
