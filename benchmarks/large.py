@@ -114,7 +114,7 @@ def simulation_table(option: str, sizes: Sequence[int]) -> str:
                 f"{found['core']:,.0f}",
                 f"{found['made']:.1f}",
                 f"{found['compiled']:.1f}",
-                f"{1e3 * found['year']:.2g}",
+                f"{1e3 * found['year']:.3g}",
                 f"{1e6 * found['year'] / found['arcs']:.2g}",
                 f"{found['memory']:.2g}",
             )
