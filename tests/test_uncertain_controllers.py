@@ -22,9 +22,10 @@ from cirl_marl.evaluation import calibration
 from cirl_marl.evaluation.calibration import calibrate
 from cirl_marl.network.disturbances import DisturbanceEffect, Markov
 from cirl_marl.network.processes import DisturbanceProcesses
-from cirl_marl.optimum import NoCertificate, Sampling, mpc, simulate_plan
+from cirl_marl.optimum import NoCertificate, Sampling, futures, simulate_plan
 from cirl_marl.optimum.blind import BestConstant, BestSchedule, Replay
-from cirl_marl.optimum.mpc import MPC, future_noise
+from cirl_marl.optimum.futures import future_noise
+from cirl_marl.optimum.mpc import MPC
 from cirl_marl.optimum.registry import named_controller
 from cirl_marl.report.tradeoffs import comparison_notes
 
@@ -103,9 +104,9 @@ def test_without_noise_all_plans_are_one(make_network: Callable[..., Network]) -
         if not network.agents or not disturbed.disturbed:
             continue
         runs = []
-        for case, futures in ((network, None), (disturbed, None), (disturbed, 1), (disturbed, 2)):
+        for case, count in ((network, None), (disturbed, None), (disturbed, 1), (disturbed, 2)):
             env = MultiAgentVectorEnv(case, num_envs=1)
-            controller = MPC(horizon=3, replan=1, service_weight=1000.0, futures=futures)
+            controller = MPC(horizon=3, replan=1, service_weight=1000.0, futures=count)
             try:
                 runs.append(rollout(env, controller, seed=first_seed(1)))
             except NoCertificate:
@@ -285,7 +286,7 @@ def test_bad_input(make: Callable[[], Controller], message: str) -> None:
 
 def test_programs_of_too_many_futures_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """With their size, before they are solved."""
-    monkeypatch.setattr(mpc, "MOST_VARIABLES", 100)
+    monkeypatch.setattr(futures, "MOST_VARIABLES", 100)
     message = r"the program of 32 futures of 3 intervals has [\d,]+ variables, more than 100"
     with pytest.raises(CirlError, match=message):
         rollout(MultiAgentVectorEnv(works(3), num_envs=1), MPC(min_service=0.5, futures=32))

@@ -15,7 +15,7 @@ from cirl_marl.errors import CirlError, RunError
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Network
 from cirl_marl.optimum.draws import Prices
-from cirl_marl.optimum.registry import CONTROLLERS, PLANNERS, TUNABLE, named_controller
+from cirl_marl.optimum.registry import CONTROLLERS, PLANNERS, TUNABLE, controllers_by_margin
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,6 +161,6 @@ def _controller(
     prices: Prices | None,
 ) -> Contender:
     service = min_service if name in PLANNERS else None
-    controller = partial(named_controller, name, min_service=service, futures=futures, prices=prices)
-    controller()  # an unknown name fails before anything is computed
+    # an unknown name fails here, before anything is computed
+    controller = controllers_by_margin(name, min_service=service, futures=futures, prices=prices)
     return Contender(name, None, None, controller, env, name in TUNABLE)

@@ -13,7 +13,7 @@ from scipy import special
 from cirl_marl.errors import unknown_name
 from cirl_marl.network.declarations import CheckedRecord, Positive, Quantity, Word, declarations, frozen_record
 from cirl_marl.network.elements import FIXED_LIFETIME, Arc, Control, ControlKind, Law, Node, Service
-from cirl_marl.network.rowsum import Floats, single_column
+from cirl_marl.network.rowsum import Floats, Integers, single_column
 from cirl_marl.network.series import Series, Value, extremes, in_intervals
 from cirl_marl.network.specification import Specification
 from cirl_marl.network.split_fractions import ROUNDING, Split, proportions, splits, trap_problems
@@ -298,6 +298,27 @@ def draw_network(network: Any, factors: Sequence[float] = (), path: Floats | Non
     groups = {key: tuple(map(with_draws, getattr(network, key))) for key in KINDS}
     certain: dict[str, Any] = {"uncertain": {}, "disturbances": {}, "disturbed": {}, "correlation": None}
     return replace(network, **groups, **certain, scenarios={})
+
+
+def network_of_intervals(network: Any, intervals: Integers) -> Any:
+    """Return the network with other control intervals, of which interval j is as ``intervals[j]`` of its own.
+
+    Histories and disturbances stay as they are.
+    """
+    length = network.episode.control_interval
+
+    def moved(part: Any) -> Any:
+        series = {
+            name: in_intervals(network.interval_means(value)[intervals], length) or Series(times=(0.0,), values=(0.0,))
+            for name, declaration in declarations(type(part)).items()
+            if isinstance(value := getattr(part, name), Series) and not getattr(declaration, "past", False)
+        }
+        if getattr(part, "control", None) is not None:
+            series["control"] = moved(part.control)
+        return replace(part, **series)
+
+    groups = {key: tuple(map(moved, getattr(network, key))) for key in KINDS}
+    return replace(network, **groups, episode=replace(network.episode, horizon=len(intervals)), scenarios={})
 
 
 def _times(network: Specification, value: Value, factor: float, most: float = math.inf) -> Value:

@@ -160,22 +160,43 @@ class Admissible:
     @cached_property
     def kinds(self) -> Integers:
         """For each interval the first that is like it but for what flows by schedule, shape (steps,)."""
+        parts = [self._by_interval, self.service_low]
+        _, first, kind = np.unique(np.concatenate(parts, axis=1), axis=0, return_index=True, return_inverse=True)
+        kinds: Integers = first[kind.ravel()]
+        return kinds
+
+    @cached_property
+    def _by_interval(self) -> Floats:
+        """All that rows of an interval follow from, but for bands of services, shape (steps, numbers)."""
         stock_driven = ~self.by_schedule
         parts = [
             *self.setting[:, :, stock_driven],
             self.base[:, stock_driven],
             *self.valve,
             self.neutral_rate[:, stock_driven],
+            *(split.proportions.T for split in self.splits),
         ]
-        parts += [self.service_low, *(split.proportions.T for split in self.splits)]
-        _, first, kind = np.unique(np.concatenate(parts, axis=1), axis=0, return_index=True, return_inverse=True)
-        kinds: Integers = first[kind.ravel()]
-        return kinds
+        return np.concatenate(parts, axis=1)
+
+    def key(self, interval: int) -> bytes:
+        """Return what is the same in intervals that have the same rows, but for the bands of services."""
+        return bytes(self._by_interval[interval])
 
     @cached_property
     def ranges(self) -> dict[int, IntervalRanges]:
-        """The ranges in the intervals of each kind."""
-        return {kind: IntervalRanges(self, kind) for kind in np.unique(self.kinds).tolist()}
+        """The ranges in the intervals of each kind, read off when they are asked for."""
+        return _RangesByKind(self)
+
+
+class _RangesByKind(dict[int, "IntervalRanges"]):
+    """The ranges of each kind of interval."""
+
+    def __init__(self, admissible: Admissible) -> None:
+        self._admissible = admissible
+
+    def __missing__(self, kind: int) -> IntervalRanges:
+        ranges = self[kind] = IntervalRanges(self._admissible, kind)
+        return ranges
 
 
 class IntervalRanges:

@@ -1,14 +1,17 @@
 """The best that can be done without looking: one action for all time, or one schedule for all that may happen.
 
-Both are optimised over common draws of all that episodes draw, with the cross-entropy method: the best constant from
-the ends and the middle of all ranges, the best schedule from that constant and from plans for what is expected, which
-demand more or less of the services than is expected of them.
+Both are optimised over common draws of all that episodes draw. The best constant is found by the cross-entropy method,
+from the ends and the middle of all ranges; the best schedule climbs exact gradients (``improve_schedule``), from that
+constant and from the best plan for what is expected, which may demand more of the services than is expected of them.
+Networks without derivatives are searched.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from copy import copy
 from functools import partial
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,7 +19,7 @@ from numpy.typing import ArrayLike
 from cirl_marl.controllers.basic import Arrays, Controller, Planner
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, ControlError
-from cirl_marl.network import Floats
+from cirl_marl.network import Floats, Network
 from cirl_marl.network.uncertainty import expected_network
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.bounds import bound
@@ -24,6 +27,7 @@ from cirl_marl.optimum.cross_entropy import KNOTS, SHORTFALL_PRICE, explore, obj
 from cirl_marl.optimum.improve import improve_plan
 from cirl_marl.optimum.options import check_margin, check_options, demanded_levels, starting_stocks, with_margin
 from cirl_marl.optimum.planned_episodes import DrawnPopulation
+from cirl_marl.optimum.schedule_ascent import ScheduleAscent, improve_schedule
 from cirl_marl.optimum.window_planner import Future, WindowPlanner
 from cirl_marl.optimum.windows import WindowTask
 
@@ -37,6 +41,8 @@ LEVELS = (-1.0, -0.5, 0.0, 0.5, 1.0)
 """Actions with which the search for a constant begins."""
 DEGREE, ROUNDS = 1, 10
 """Of the programs of plans, and most steps by which the last of them is improved."""
+UPDATES, FEWER_UPDATES, LESS = 200, 60, 0.05
+"""Of the ascent, and where it begins with what was found for another margin; the rate of the latter."""
 SHORTFALL, RISE, RISES = 5e-4, 10.0, 2
 """Expected level that may be lacking without a higher price of it; by what that is multiplied, how often at most."""
 
@@ -85,7 +91,7 @@ class BestConstant(Planner):
         Args:
             min_service: expected level demanded of every service, or of each, shape (services,), a share in [0, 1].
             service_weight: w of λ̄/circularity_scale + w·service; excludes ``min_service``.
-            margin: by what the demanded levels are multiplied, up to 1.
+            margin: by what the share of each service that may lack is divided.
             draws: of which the mean counts; seeds of their own.
             population: actions tried in an iteration.
 
@@ -98,13 +104,37 @@ class BestConstant(Planner):
             raise CirlError(f"draws {draws}: too few to say what is best on average, at least {FEWEST}")
         self._min_service, self._weight = min_service, service_weight
         self._margin, self._draws, self._population = margin, draws, population
+        self._results: list[tuple[Network, dict[float, Floats]]] = []
         self.actions = np.empty((0, 0))
+
+    def with_margin(self, margin: float) -> Self:
+        """Return one with another margin, which begins with what is found for others."""
+        check_margin(margin)
+        other = copy(self)
+        other._margin = margin
+        return other
 
     def plan(self, env: MultiAgentVectorEnv, seed: int, progress: Callable[[float], None]) -> None:
         """Look for the actions; ``seed`` has no effect."""
-        self.actions = self._search(env, LEVELS, self.knots, progress)
+        if not self._results or self._results[0][0] is not env.network:
+            self._results[:] = [(env.network, {})]
+        by_margin = self._results[0][1]
+        if self._margin not in by_margin:
+            nearest = min(by_margin, key=lambda margin: abs(margin - self._margin), default=None)
+            by_margin[self._margin] = self._best(env, None if nearest is None else by_margin[nearest], progress)
+        self.actions = by_margin[self._margin]
         self._replay = Replay(self.actions)
         self._replay.start(env, seed)
+
+    def _best(self, env: MultiAgentVectorEnv, similar: Floats | None, progress: Callable[[float], None]) -> Floats:
+        """Return the best actions, beginning with what is best for another margin, if that is known."""
+        return self._search(env, LEVELS if similar is None else (*LEVELS, similar), self.knots, progress)
+
+    def _demand(self, network: Network) -> Floats | None:
+        """Return the expected levels that are aimed at, shape (services,)."""
+        if self._min_service is None:
+            return None
+        return 1.0 - (1.0 - demanded_levels(network, self._min_service)) / self._margin
 
     def act(self, observations: Arrays) -> Arrays:
         """Return the actions of the interval."""
@@ -113,15 +143,13 @@ class BestConstant(Planner):
     def _search(
         self,
         env: MultiAgentVectorEnv,
-        candidates: Iterator[Floats] | tuple[float, ...],
+        candidates: Sequence[float | Floats],
         knots: int,
         progress: Callable[[float], None],
     ) -> Floats:
         """Return the best actions that are found, shape (1 or steps, entries)."""
         network, entries = env.network, sum(action.shape[1] for action in env.neutral_action.values())
-        demand = np.zeros(0)
-        if self._min_service is not None:
-            demand = np.minimum(self._margin * demanded_levels(network, self._min_service), 1.0)
+        demand = np.zeros(0) if (aim := self._demand(network)) is None else np.maximum(aim, 0.0)
         seeds, price = range(FIRST_DRAW, FIRST_DRAW + self._draws), SHORTFALL_PRICE
         actions = [part if np.ndim(part) else np.full((1, entries), part) for part in candidates]
         for rise in range(RISES + 1):
@@ -150,14 +178,36 @@ class BestSchedule(BestConstant):
 
     iterations = 40
 
-    def plan(self, env: MultiAgentVectorEnv, seed: int, progress: Callable[[float], None]) -> None:
-        """Look for the actions; ``seed`` has no effect."""
-        constant = self._search(env, LEVELS, 1, lambda share: progress(0.3 * share))
-        candidates = [constant, *self._plans(env)]
-        knots = min(KNOTS, env.network.episode.horizon)
-        self.actions = self._search(env, iter(candidates), knots, lambda share: progress(0.4 + 0.6 * share))
-        self._replay = Replay(self.actions)
-        self._replay.start(env, seed)
+    def _best(self, env: MultiAgentVectorEnv, similar: Floats | None, progress: Callable[[float], None]) -> Floats:
+        try:
+            if similar is not None:
+                return self._ascend(env, similar, FEWER_UPDATES, LESS).actions
+            constant = self._search(env, LEVELS, 1, lambda share: progress(0.3 * share))
+            plans = sorted((self._ascend(env, plan, 0) for plan in self._plans(env)), key=self._rank(env))
+            starts = [constant, *(plan.actions for plan in plans[-1:])]
+            progress(0.4)
+            return max((self._ascend(env, start, UPDATES) for start in starts), key=self._rank(env)).actions
+        except CirlError as reason:
+            self.note = f"found by search, without derivatives: {reason}"
+        candidates: list[float | Floats] = [*LEVELS, *self._plans(env)] if similar is None else [similar]
+        return self._search(env, candidates, min(KNOTS, env.network.episode.horizon), progress)
+
+    def _ascend(self, env: MultiAgentVectorEnv, start: Floats, updates: int, rate: float = 0.2) -> ScheduleAscent:
+        """Return the best schedule met on the way up from one, over the common draws."""
+        draws = MultiAgentVectorEnv(env.network, num_envs=self._draws, agents=env.agents, uncertain=env.uncertain)
+        draws.reset(seed=list(range(FIRST_DRAW, FIRST_DRAW + self._draws)))
+        demand, weight = self._demand(env.network), self._weight
+        return improve_schedule(draws, start, min_service=demand, service_weight=weight, updates=updates, rate=rate)
+
+    def _rank(self, env: MultiAgentVectorEnv) -> Callable[[ScheduleAscent], tuple[float, float]]:
+        """Return by what schedules are told apart: what they lack, then what they are worth."""
+        scale, demand, weight = env.network.objective.circularity_scale, self._demand(env.network), self._weight or 0.0
+
+        def rank(best: ScheduleAscent) -> tuple[float, float]:
+            lack = 0.0 if demand is None else max(0.0, float((demand - best.levels).max(initial=0.0)) - SHORTFALL)
+            return -lack, best.circularity / scale + weight * float(best.levels.mean() if best.levels.size else 0.0)
+
+        return rank
 
     def _plans(self, env: MultiAgentVectorEnv) -> Iterator[Floats]:
         """Yield the actions of plans for what is expected, from the middle of the initial ranges."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable
 from itertools import product
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,10 +12,35 @@ from scipy import sparse
 
 from cirl_marl.network import Floats, Integers, Network
 
+T = TypeVar("T")
+RowParts = tuple[Any, Any, Any]
+"""Rows over their interval, over the one before, and what scheduled arcs loosen them by, all sparse."""
 KEYS = 6
 """Whole numbers that say where a row comes."""
+MOST_ENTRIES = 4096
+"""Of a cache, which is emptied then."""
 NOW, BEFORE, LOOSER = range(3)
 """What rows have entries of: their interval, the one before, and what scheduled arcs are asked for."""
+
+
+class IntervalCache:
+    """What follows from the ranges of an interval alone, for the programs of networks that are alike in some of them.
+
+    What a key stands for never depends on what was asked for before.
+    """
+
+    def __init__(self) -> None:
+        """Begin with nothing."""
+        self._values: dict[Hashable, Any] = {}
+
+    def value(self, key: Hashable, make: Callable[[], T]) -> T:
+        """Return what ``make`` makes, which is not called where the key is known."""
+        if key not in self._values:
+            if len(self._values) >= MOST_ENTRIES:
+                self._values.clear()
+            self._values[key] = make()
+        value: T = self._values[key]
+        return value
 
 
 class Layout:
@@ -85,6 +111,19 @@ class Layout:
         self.free_valve = self.imbalance + 1
         self.size = self.free_valve + len(free_valves)
 
+    @property
+    def key(self) -> Hashable:
+        """What is the same in layouts that are alike, of one network."""
+        sizes = self.size, self.pieces, self.degree, self.length, self.coarse, self.has_end_flows
+        return (*sizes, self.valves.tobytes(), self.free_valves.tobytes())
+
+    def with_levels(self, rows: Any, service_low: Floats) -> Any:
+        """Return rows of an interval with other bands of services, whose lower ends stand at the levels."""
+        service, data = rows.indices - self.level, rows.data.copy()
+        is_level = (service >= 0) & (service < len(service_low))
+        data[is_level] = service_low[service[is_level]]
+        return sparse.csr_array((data, rows.indices, rows.indptr), shape=rows.shape)
+
     def means(self, plan: Floats) -> tuple[Floats, Floats, Floats]:
         """Return the plain means of X, F and Z over each interval, shape (steps, nodes | arcs | valves)."""
         counts = (len(self.network.nodes), len(self.network.arcs), len(self.valves))
@@ -149,7 +188,7 @@ class ProgramRows:
             limits[rows] = values
         return limits[self._order()]
 
-    def matrices(self) -> tuple[Any, Any, Any]:
+    def matrices(self) -> RowParts:
         """Return the rows over the intervals and over the one before, and what arcs loosen them by, all sparse."""
         place = np.empty(self._count, dtype=np.intp)
         place[self._order()] = np.arange(self._count)
@@ -174,15 +213,13 @@ class ChainedRows:
     def __init__(self, layout: Layout) -> None:
         """Begin without rows."""
         self._layout = layout
-        self._links: dict[int, tuple[Any, Any, Any]] = {}
-        self._alone: dict[int, tuple[Any, Any, Any]] = {}
+        self._links: dict[int, RowParts] = {}
+        self._alone: dict[int, RowParts] = {}
         self._cache: dict[bytes, tuple[Any, Any]] = {}
 
-    def add(self, kind: int, links: ProgramRows, alone: ProgramRows) -> None:
+    def add(self, kind: int, links: RowParts, alone: RowParts) -> None:
         """Take the rows of a kind of interval: those that link it to the one before, and the others."""
-        self._links[kind], self._alone[kind] = links.matrices(), alone.matrices()
-        for part in (NOW, BEFORE):
-            self._links[kind][part].eliminate_zeros()
+        self._links[kind], self._alone[kind] = links, alone
 
     def at_start(self, kind: int) -> Any:
         """Return what the linked rows of a kind of interval have of the stocks at its start, (rows, stores), sparse."""

@@ -18,7 +18,7 @@ present states (certainty equivalence), or for several futures drawn from there,
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Annotated
 
@@ -31,11 +31,12 @@ from cirl_marl.errors import CirlError, ControlError, whole_number
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.innovations import innovations
-from cirl_marl.network.uncertainty import draw_network, expected_network
+from cirl_marl.network.uncertainty import expected_network
 from cirl_marl.optimum.admissible import Admissible, NoCertificate
 from cirl_marl.optimum.bounds import Bound, bound
 from cirl_marl.optimum.cross_entropy import KNOTS, Incumbent, search_each
 from cirl_marl.optimum.draws import Prices
+from cirl_marl.optimum.futures import DrawnFutures
 from cirl_marl.optimum.improve import improve_plan
 from cirl_marl.optimum.options import check_margin, check_options, demanded_levels, starting_stocks, with_margin
 from cirl_marl.optimum.planned_episodes import Plan, starting_states
@@ -50,12 +51,8 @@ LEAST_PRICE = 0.1
 """Least that is charged for a unit of service that lacks in a disturbed network, in λ̄/circularity_scale."""
 WINDOW = 10
 """Decisions that a plan looks ahead where the network is disturbed, unless another number is asked for."""
-FUTURES_SEED = 38
-"""Of the noise of futures, the same in every episode."""
 FIRST_SAMPLE, SAMPLES = 2**30, 256
 """First seed and number of the paths over which what is expected of their functions is averaged."""
-MOST_VARIABLES = 50_000
-"""Variables of the largest program of several futures."""
 BOUND = 0.3
 """About the share of solving for the bound in the work on a plan; the rest is to improve it."""
 
@@ -145,12 +142,13 @@ class MPC(Planner):
         self.note, self._env, is_disturbed = "", env, bool(network.disturbed)
         self._horizon = (WINDOW if self._prices is None else 1) if horizon is None and is_disturbed else horizon
         self._replan = (1 if is_disturbed else 4) if replan is None else replan
-        self._futures = futures if is_disturbed else None
-        self._prior = network.processes.prior_means(network.episode.horizon)
         if self._prices is not None:
             paths = network.processes.sample(range(FIRST_SAMPLE, FIRST_SAMPLE + SAMPLES)).states
             self._mean_features = innovations(network.processes, paths[:-1]).features.mean(axis=2)
-        self._planner = WindowPlanner([self._future(self._prior)], self._weight)
+        expected, self._planners = self._future_as_expected(), dict[int, WindowPlanner]()
+        self._planner, self._drawn = WindowPlanner([expected], self._weight), None
+        if is_disturbed:
+            self._drawn = DrawnFutures(env, expected, self._degree, self._weight, futures)
         supplies = {arc.makes_up_for for arc in network.arcs if arc.makes_up_for and arc.id not in env.agents}
         self._full = np.array([service.id in supplies for service in network.services], dtype=bool)
         self._outlooks: dict[int, WindowPlan] = {}
@@ -166,6 +164,7 @@ class MPC(Planner):
                 least = LEAST_PRICE * network.objective.circularity_scale
                 self._price = self._margin * np.maximum(multipliers, least)
         self._plans = []
+        self._look_ahead(range(env.num_envs))
         for copy in range(env.num_envs):
             self._plans.append(self._next(copy, None))
             progress((copy + 1) / env.num_envs)
@@ -176,15 +175,15 @@ class MPC(Planner):
         Raises:
             ControlError: after the end of the episode.
         """
-        env = self._env
-        actions = []
-        for copy, step in enumerate(env.physical.step.tolist()):
-            plan = self._plans[copy]
-            if plan.episode != env.episodes[copy]:
-                plan = self._plans[copy] = self._next(copy, None)
-            elif not 0 <= step - plan.first < len(plan.actions):
-                plan = self._plans[copy] = self._next(copy, plan)
-            actions.append(plan.actions[step - plan.first])
+        env, steps, plans = self._env, self._env.physical.step.tolist(), self._plans
+        is_new = [plan.episode != env.episodes[copy] for copy, plan in enumerate(plans)]
+        over = [
+            new or not 0 <= step - p.first < len(p.actions) for new, step, p in zip(is_new, steps, plans, strict=True)
+        ]
+        self._look_ahead(copies := np.flatnonzero(over).tolist())
+        for copy in copies:
+            plans[copy] = self._next(copy, None if is_new[copy] else plans[copy])
+        actions = [plan.actions[step - plan.first] for step, plan in zip(steps, plans, strict=True)]
         return env.unstack(np.stack(actions, axis=1))
 
     def _next(self, copy: int, last: _Plan | None) -> _Plan:
@@ -193,7 +192,7 @@ class MPC(Planner):
         step = int(state.step[copy])
         if step >= steps:
             raise ControlError(f"MPC: the episode is over after {steps} steps: call reset()")
-        rest = range(step, steps)
+        rest = self._rest(step)
         window = rest if self._horizon is None else rest[: self._horizon]
         earlier = None if last is None else last.window
         try:
@@ -270,7 +269,7 @@ class MPC(Planner):
             is_outlook: whether the multipliers must be good, as they are the prices of later plans.
         """
         stock = self._env.physical.stock[self._env.rows.nodes, copy]
-        planner = self._planner if is_outlook else self._planner_at(copy, intervals)
+        planner = self._planner if is_outlook or self._drawn is None else self._planners[copy]
         return self._solve_task(planner, stock, intervals, deficit, last, later, is_outlook=is_outlook)
 
     def _solve_task(
@@ -296,51 +295,30 @@ class MPC(Planner):
         task = WindowTask(stock, intervals, demand, later, price, corrections, is_outlook, is_redrawn)
         return planner.plan(task, last.basis(intervals) if last else None, self._replan)
 
-    def _planner_at(self, copy: int, intervals: range) -> WindowPlanner:
-        """Return what plans some intervals of a copy, from the first of which on nobody knows the disturbances.
+    def _look_ahead(self, copies: Sequence[int]) -> None:
+        """Prepare plans of some copies of a disturbed network, each for its own futures."""
+        if self._drawn is None:
+            return
+        steps = self._env.physical.step[list(copies)]
+        for step in np.unique(steps[steps < self._env.network.episode.horizon]).tolist():
+            alike = [copy for copy, own in zip(copies, steps.tolist(), strict=True) if own == step]
+            futures = self._drawn.of(alike, self._rest(step)[: self._horizon])
+            self._planners |= {c: WindowPlanner(own, self._weight) for c, own in zip(alike, futures, strict=True)}
 
-        Raises:
-            CirlError: for a program of several futures that is too large.
-        """
-        network, step = self._env.network, intervals.start
-        if not network.disturbed:
-            return self._planner
-        states, processes, ahead = self._env.physical.processes[step, :, [copy]].T, network.processes, len(intervals)
-        paths = processes.values(states, step)[None]
-        if self._futures is None:
-            paths = np.concatenate([paths, processes.conditional_means(states, step, ahead - 1)])
-        else:
-            noise = future_noise(step, ahead - 1, len(states), self._futures)
-            paths = processes.continuations(np.repeat(states, self._futures, axis=1), step, noise).values
-        futures = []
-        for values in np.moveaxis(paths, 2, 0):
-            path = self._prior.copy()
-            path[step : intervals.stop] = values
-            futures.append(self._future(path, intervals))
-            if not futures[1:]:
-                self._check_size(futures[0], ahead)
-        return WindowPlanner(futures, self._weight)
+    def _rest(self, step: int) -> range:
+        """Return what is left of an episode."""
+        return range(step, self._env.network.episode.horizon)
 
-    def _check_size(self, future: Future, intervals: int) -> None:
-        size = (self._futures or 1) * intervals * future.layout.size
-        if self._futures is not None and size > MOST_VARIABLES:
-            name, shape = self._env.network.name, f"{self._futures} futures of {intervals} intervals"
-            raise CirlError(
-                f"network '{name}': the program of {shape} has {size:,} variables, more than {MOST_VARIABLES:,}; take "
-                "fewer futures or a shorter horizon"
-            )
-
-    def _future(self, path: Floats, intervals: range | None = None) -> Future:
-        """Return the network in which disturbances follow a path, shape (horizon, names), as plans have it."""
+    def _future_as_expected(self) -> Future:
+        """Return the network in which disturbances are as expected from the start, as plans have it."""
         env, network = self._env, self._env.network
         if network.disturbed:
-            network = draw_network(network, (), path)
+            network = expected_network(network)
             if env.dynamics.substeps > 1:
                 network = network.with_options(episode={"solver_step": env.dynamics.substep})
         elif self._levels is not None:
             network = with_margin(network, self._margin)
-        admissible = Admissible.of(network, env.agents or None)
-        return Future(admissible, self._degree, self._weight, intervals)
+        return Future(Admissible.of(network, env.agents or None), self._degree, self._weight)
 
     def _expected_outlook(self) -> WindowPlan:
         """Return the plan of an episode in which all is as expected, from the middle of the initial ranges."""
@@ -348,17 +326,6 @@ class MPC(Planner):
         deficit = None if self._levels is None else self._levels * len(steps)
         stock = starting_stocks(future.admissible.lifetimes, None)
         return self._solve_task(self._planner, stock, steps, deficit, None, is_outlook=True)
-
-
-def future_noise(step: int, intervals: int, names: int, futures: int) -> Floats:
-    """Return standard normal numbers for futures drawn in interval ``step``, shape (intervals, names, futures).
-
-    The same in every episode, so that what is done follows from the state alone. Every second future has those of the
-    one before with the other sign (antithetic variates).
-    """
-    half = np.random.default_rng([FUTURES_SEED, step]).standard_normal((intervals, names, (futures + 1) // 2))
-    pairs = np.stack([half, -half], axis=3)
-    return pairs.reshape(intervals, names, 2 * half.shape[2])[:, :, :futures]
 
 
 class Optimum(Planner):

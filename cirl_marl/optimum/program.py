@@ -7,6 +7,7 @@ flows weighted with B_i. Integration by parts and the flow laws hold for them ex
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from cirl_marl.optimum.constraints import (
     throughputs,
     valve_envelopes,
 )
-from cirl_marl.optimum.matrices import ChainedRows, Layout, ProgramRows
+from cirl_marl.optimum.matrices import BEFORE, NOW, ChainedRows, IntervalCache, Layout, ProgramRows, RowParts
 from cirl_marl.optimum.quasi_steady import decay_rows, end_laws, has_fast_stocks, quasi_steady_rows
 from cirl_marl.optimum.reach import ComparisonSystem, Reach
 from cirl_marl.optimum.vintages import Lifetimes
@@ -86,6 +87,8 @@ class Programs:
         merge_pieces: bool | None = None,
         system: ComparisonSystem | None = None,
         intervals: range | None = None,
+        layout: Layout | None = None,
+        cache: IntervalCache | None = None,
     ) -> None:
         """Write down what does not depend on the start.
 
@@ -99,36 +102,55 @@ class Programs:
                 were large otherwise.
             system: of a program of the same network and agents, whatever their services demand.
             intervals: that programs will be of; None: of all.
+            layout: of another program of the network, whatever its numbers; None: what its own ask for.
+            cache: of programs of other numbers in the same network, with the same agents.
         """
         self.admissible, lifetimes = admissible, admissible.lifetimes
         has_lifetimes = lifetimes.plan_network is not lifetimes.reach_network
         if system is None:
             chain_form = Admissible.of(lifetimes.reach_network, admissible.agents) if has_lifetimes else admissible
-            system = ComparisonSystem(chain_form)
+            system = ComparisonSystem(chain_form, cache)
         self.system = system
-        self.layout = layout = _layout(admissible, system.substeps, merge_pieces, degree)
-        fast_system = ComparisonSystem(admissible) if has_lifetimes and layout.has_end_flows else system
+        self.layout = layout = layout or _layout(admissible, system.substeps, merge_pieces, degree)
+        fast_system = ComparisonSystem(admissible, cache) if has_lifetimes and layout.has_end_flows else system
         self._equal, self._under = ChainedRows(layout), ChainedRows(layout)
         period = slice(None) if intervals is None else slice(intervals.start, intervals.stop)
         for kind in np.unique(admissible.kinds[period]).tolist():
-            ranges = admissible.ranges[kind]
-            equal_links, equal, under_links, under = (ProgramRows(layout) for _ in range(4))
-            balances(equal_links)
-            constant_schedules(ranges, equal, under)
-            flow_laws(ranges, equal, under)
-            throughputs(ranges, equal)
-            if hold_controls:
-                held_arcs = np.flatnonzero(ranges.proportional & (ranges.rate[0] < ranges.rate[1]))
-                held_controls(ranges.driver, held_arcs, ranges.neutral_rate[None], ranges.neutral_valve[None], equal)
-            delivery_limits(ranges, under_links)
-            service_levels(ranges, under)
-            decay_rows(ranges, under_links)
-            if layout.has_end_flows:
-                end_laws(ranges, equal, under)
-                quasi_steady_rows(ranges, fast_system.of_interval(kind), under_links)
+            rows = partial(self._interval_rows, kind, hold_controls, fast_system)
+            if cache is None:
+                equal_links, equal, under_links, under = rows()
+            else:
+                key = ("rows", layout.key, hold_controls, admissible.key(kind))
+                equal_links, equal, under_links, (now, before, looser) = cache.value(key, rows)
+                under = layout.with_levels(now, admissible.service_low[kind]), before, looser
             self._equal.add(kind, equal_links, equal)
             self._under.add(kind, under_links, under)
         self._weights, self._constant = objective(layout, service_weight)
+
+    def _interval_rows(
+        self, kind: int, hold_controls: bool, fast_system: ComparisonSystem
+    ) -> tuple[RowParts, RowParts, RowParts, RowParts]:
+        """Return the rows of A of a kind of interval that link it to the one before, the others, and those of G."""
+        layout, ranges = self.layout, self.admissible.ranges[kind]
+        equal_links, equal, under_links, under = (ProgramRows(layout) for _ in range(4))
+        balances(equal_links)
+        constant_schedules(ranges, equal, under)
+        flow_laws(ranges, equal, under)
+        throughputs(ranges, equal)
+        if hold_controls:
+            held_arcs = np.flatnonzero(ranges.proportional & (ranges.rate[0] < ranges.rate[1]))
+            held_controls(ranges.driver, held_arcs, ranges.neutral_rate[None], ranges.neutral_valve[None], equal)
+        delivery_limits(ranges, under_links)
+        service_levels(ranges, under)
+        decay_rows(ranges, under_links)
+        if layout.has_end_flows:
+            end_laws(ranges, equal, under)
+            quasi_steady_rows(ranges, fast_system.of_interval(kind), under_links)
+        links = equal_links.matrices(), under_links.matrices()
+        for matrices in links:
+            for part in (NOW, BEFORE):
+                matrices[part].eliminate_zeros()
+        return links[0], equal.matrices(), links[1], under.matrices()
 
     def rows_at_start(self, interval: int) -> tuple[Any, Any]:
         """Return what the linked rows of A and of G have of the stocks at the start of an interval, (rows, stores)."""

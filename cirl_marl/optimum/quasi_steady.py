@@ -160,7 +160,8 @@ class _DecayChains:
 def has_fast_stocks(admissible: Admissible, length: float) -> bool:
     """Return whether some stock counts as fast in pieces of a length, so that rows about it say something."""
     stores = len(admissible.network.stores)
-    return any((ranges.exits[0, :stores] * length >= FAST[0]).any() for ranges in admissible.ranges.values())
+    kinds = np.unique(admissible.kinds).tolist()
+    return any((admissible.ranges[kind].exits[0, :stores] * length >= FAST[0]).any() for kind in kinds)
 
 
 def end_laws(ranges: IntervalRanges, equal: ProgramRows, under: ProgramRows) -> None:

@@ -9,6 +9,7 @@ flow realised.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Annotated, Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from cirl_marl.dynamics.visit_bounds import VisitBounds
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import Admissible, IntervalRanges, NoCertificate
+from cirl_marl.optimum.matrices import IntervalCache
 from cirl_marl.optimum.vintages import WholeLifetime
 
 DENSE = 256
@@ -170,20 +172,14 @@ class ComparisonSystem:
         substeps: of the simulator in an interval.
     """
 
-    def __init__(self, admissible: Admissible) -> None:
-        """Compile the system for the ranges of ``admissible``."""
+    def __init__(self, admissible: Admissible, cache: IntervalCache | None = None) -> None:
+        """Compile the system for the ranges of ``admissible``; ``cache`` is that of its programs, see there."""
         self.admissible, self.network = admissible, admissible.network
         self.substeps = ArcRates(admissible.network).solver_steps()
         self.substep = self.network.episode.control_interval / self.substeps
         self._visit_bounds = VisitBounds(admissible.network, admissible.splits)
+        self._cache = cache
         self._routes: dict[bytes, RouteBounds] = {}
-        # shares of what leaves a node that stores nothing; where their ranges are widest the others begin
-        self._share_rates = {
-            kind: ranges.rate[:, self.network.donors >= len(self.network.stores)]
-            for kind, ranges in admissible.ranges.items()
-        }
-        widths = {kind: np.diff(rate, axis=0).sum() for kind, rate in self._share_rates.items()}
-        self._widest = max(widths, key=lambda kind: widths[kind])
         self._linear: dict[int, Linear] = {}
 
     def reach(
@@ -250,18 +246,45 @@ class ComparisonSystem:
 
     def __getstate__(self) -> dict[str, object]:
         """Leave out what is found again when it is needed, and large."""
-        return {**self.__dict__, "_routes": {}, "_linear": {}}
+        return {**self.__dict__, "_routes": {}, "_linear": {}, "_cache": None}
 
     def of_interval(self, interval: int) -> Linear:
         """Return what is proportional to stocks in an interval."""
         kind = int(self.admissible.kinds[interval])
         if kind not in self._linear:
-            self._linear[kind] = Linear(self.admissible.ranges[kind], self._routes_of(kind), self.substep)
+            self._linear[kind] = self._linear_of(kind)
         return self._linear[kind]
+
+    def _linear_of(self, kind: int) -> Linear:
+        admissible, cache = self.admissible, self._cache
+        if cache is None:
+            return Linear(admissible.ranges[kind], self._routes_of(kind), self.substep)
+        shares, size = self._share_rates(kind).tobytes(), len(self.network.nodes)
+
+        def routes() -> RouteBounds:  # what is found must not depend on what else there is: it begins from nowhere
+            return RouteBounds(admissible.ranges[kind], self._visit_bounds, kind)
+
+        def linear() -> Linear:
+            return Linear(admissible.ranges[kind], cache.value(("routes", size, shares), routes), self.substep)
+
+        return cache.value(("linear", size, self.substep, admissible.key(kind)), linear)
+
+    def _share_rates(self, kind: int) -> Floats:
+        """Return the least and greatest shares of what leaves nodes that store nothing, shape (2, some arcs)."""
+        rates: Floats = self.admissible.rate[:, kind, self.network.donors >= len(self.network.stores)]
+        return rates
+
+    @cached_property
+    def _widest(self) -> int:
+        """The kind of intervals in which the ranges of these shares are widest; from there the others begin."""
+        widths = {
+            int(kind): np.diff(self._share_rates(kind), axis=0).sum() for kind in np.unique(self.admissible.kinds)
+        }
+        return max(widths, key=lambda kind: widths[kind])
 
     def _routes_of(self, kind: int) -> RouteBounds:
         """Return what holds in a kind of interval, found from what holds where ranges are widest."""
-        key = self._share_rates[kind].tobytes()
+        key = self._share_rates(kind).tobytes()
         if key not in self._routes:
             wider = None if kind == self._widest else self._routes_of(self._widest)
             self._routes[key] = RouteBounds(self.admissible.ranges[kind], self._visit_bounds, kind, wider)

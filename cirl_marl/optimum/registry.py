@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
@@ -17,7 +18,9 @@ if TYPE_CHECKING:
 
 SETTABLE = ("constant", "scripted")
 """Controllers that take values for single agents."""
-UNCERTAIN = ("scenario_mpc", "best_constant", "best_schedule", "price_policy")
+BLIND = ("best_constant", "best_schedule")
+"""Controllers that do not look."""
+UNCERTAIN = ("scenario_mpc", *BLIND, "price_policy")
 """Controllers for networks in which something is drawn."""
 CONTROLLERS = ("neutral", "constant", "random", "scripted", "lqr", "mpc", "optimum", *UNCERTAIN)
 PLANNERS = ("mpc", "optimum", *UNCERTAIN)
@@ -46,7 +49,7 @@ def named_controller(
         min_service: mean level of every service, or of each, shape (services,), that PLANNERS plan for; None: as much
             as can be had.
         smooth: whether the plans of ``optimum`` are to change little; see ``Optimum``.
-        margin: by what those of TUNABLE multiply what they aim at.
+        margin: by what those of TUNABLE multiply what they aim at, or divide what may lack.
         futures: that ``scenario_mpc`` plans for; None: FUTURES.
         prices: of a bound for who does not foresee, which ``price_policy`` needs.
 
@@ -75,6 +78,20 @@ def named_controller(
     return makers[name]()
 
 
+def controllers_by_margin(name: str, **options: Any) -> Callable[..., Controller]:
+    """Return what makes a controller with a ``margin``; see ``named_controller``, which takes the other ``options``.
+
+    Blind ones, which take long to be found, begin with what others of them found.
+    """
+    first = named_controller(name, **options)
+    if name in BLIND:
+        from cirl_marl.optimum.blind import BestConstant
+
+        assert isinstance(first, BestConstant)
+        return lambda margin=1.0: first.with_margin(margin)
+    return partial(named_controller, name, **options)
+
+
 def _planner(
     name: str,
     min_service: ArrayLike | None,
@@ -100,5 +117,5 @@ def _planner(
         return MPC(prices=prices, **demand)
     if name == "scenario_mpc":
         return MPC(futures=FUTURES if futures is None else futures, **demand)
-    blind = {"best_constant": BestConstant, "best_schedule": BestSchedule}
+    blind = dict(zip(BLIND, (BestConstant, BestSchedule), strict=True))
     return blind[name](**demand) if name in blind else MPC(**demand)

@@ -31,7 +31,8 @@ def improve_schedule(
     env: MultiAgentVectorEnv,
     actions: ArrayLike,
     *,
-    min_service: float | None = None,
+    min_service: ArrayLike | None = None,
+    service_weight: float | None = None,
     updates: int = 200,
     rate: float = 0.2,
 ) -> ScheduleAscent:
@@ -45,7 +46,8 @@ def improve_schedule(
     Args:
         env: after ``reset``.
         actions: to begin with, shape (intervals, entries).
-        min_service: mean level demanded of every service; None weighs them as reward ``team`` does.
+        min_service: mean level demanded of every service, or of each, shape (services,); None weighs them.
+        service_weight: w of λ̄/c + w·(mean level), if nothing is demanded; None: as reward ``team`` has it.
         updates: steps of the ascent.
         rate: first step, in normalised actions.
 
@@ -56,6 +58,8 @@ def improve_schedule(
     schedule = stacked_schedule(env, actions).mean(axis=2)
     scale, weight = network.objective.circularity_scale, max(env.circularity_weight, 1e-6)
     prices = np.array([service.weight for service in network.services]) * (1.0 - weight) / weight
+    if service_weight is not None:
+        prices = np.full(len(prices), service_weight / max(len(prices), 1))
     mean, square, best_rank = np.zeros_like(schedule), np.zeros_like(schedule), (-np.inf, -np.inf)
     best, earlier_lacks = ScheduleAscent(schedule, 0.0, np.zeros(len(prices))), np.zeros_like(prices)
     for update in range(updates + 1):

@@ -23,8 +23,8 @@ from cirl_marl.optimum.program import LinearProgram, Program
 
 WARM_ITERATIONS = 2000
 """Simplex iterations from a given basis after which interior points, which need none, are the faster way."""
-PRIMAL = 4
-"""HiGHS's number of the primal simplex method."""
+PRIMAL, DEVEX = 4, 1
+"""HiGHS's numbers of the primal simplex method, and of the weights of edges by Devex (Forrest and Goldfarb 1992)."""
 NO_PLAN = (highspy.HighsModelStatus.kInfeasible, highspy.HighsModelStatus.kUnboundedOrInfeasible)
 """As every variable is bounded, the latter means the former."""
 HighsOptions = Mapping[str, str | float]
@@ -96,6 +96,7 @@ def solve(
     label: str = "the program",
     certify: bool = True,
     same_rows: bool = False,
+    is_near: bool = False,
 ) -> Solution:
     """Minimise cᵀv over the program.
 
@@ -108,6 +109,8 @@ def solve(
         basis: from which to start.
         label: is solved, for the message of an error.
         same_rows: whether ``basis`` is of a program that differs in the cost alone.
+        is_near: whether a few iterations from ``basis`` do. Then edges are weighted by reference frameworks (Devex),
+            which begin at 1; steepest edges begin with as many solutions as there are rows.
         certify: whether multipliers must prove the answer good; else what HiGHS calls optimal is taken at its word,
             and of other answers that satisfy the rows the best.
 
@@ -121,7 +124,7 @@ def solve(
     attempts: Sequence[HighsOptions] = LARGE_SETTINGS[0 if find_spec(EXTRA) else 1 :] if is_large else SETTINGS
     program = _ScaledProgram(problem, np.maximum(np.abs(problem.low), np.abs(problem.high)))
     for settings in (None, *attempts) if basis is not None else attempts:
-        highs = program.run(settings, basis if settings is None else None, primal=same_rows)
+        highs = program.run(settings, basis if settings is None else None, primal=same_rows, is_near=is_near)
         model_status = highs.getModelStatus()
         status, is_refused = highs.modelStatusToString(model_status), model_status in NO_PLAN
         if is_refused and settings is not None and not certify:
@@ -181,7 +184,9 @@ class _ScaledProgram:
         self._equal = len(problem.equal_to)
         self._to = np.concatenate([problem.equal_to, problem.under_to]) * self._row
 
-    def run(self, settings: HighsOptions | None, basis: Basis | None, *, primal: bool = False) -> highspy.Highs:
+    def run(
+        self, settings: HighsOptions | None, basis: Basis | None, *, primal: bool = False, is_near: bool = False
+    ) -> highspy.Highs:
         """Return HiGHS after a run with ``settings``, or of the dual or ``primal`` simplex method from ``basis``."""
         highs = highspy.Highs()  # type: ignore[no-untyped-call]
         highs.setOptionValue("output_flag", False)
@@ -196,6 +201,8 @@ class _ScaledProgram:
             highs.setBasis(first)
             if primal:
                 highs.setOptionValue("simplex_strategy", PRIMAL)
+            if is_near:
+                highs.setOptionValue("simplex_dual_edge_weight_strategy", DEVEX)
             highs.setOptionValue("simplex_iteration_limit", WARM_ITERATIONS)
         highs.run()
         return highs

@@ -32,7 +32,7 @@ from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Node
 from cirl_marl.network.lifetimes import Chain
 from cirl_marl.optimum.kernels import Kernel, unit_outflow
-from cirl_marl.optimum.matrices import Layout
+from cirl_marl.optimum.matrices import IntervalCache, Layout
 from cirl_marl.optimum.stretched import StretchedRows, planned_turnovers
 
 LOOSE = 2e-4
@@ -86,6 +86,7 @@ class Lifetimes:
         start_reached: what the stores of ``reach_network`` hold of them, likewise.
         nodes_reached: what the nodes of the planned network are of those of ``reach_network``, shape (nodes, nodes).
         arcs_reached: arcs of ``reach_network`` that are those of the planned network, shape (arcs,).
+        cache: kernels of their rows, which do for other networks whose lifetimes are alike.
         totals: what the stocks of the network are of those of the planned one, shape (stores, stores).
     """
 
@@ -95,8 +96,7 @@ class Lifetimes:
         self.simulator_network = simulated_network(network)
         self.state_layout = StateLayout(self.simulator_network)
         self.whole: list[WholeLifetime] = []
-        self._kernels: dict[tuple[str, bytes, int, int], Kernel] = {}
-        self._stretch_cache: dict[tuple[str, bytes, int, int], StretchedRows] = {}
+        self.cache = IntervalCache()
         nodes = [node for node in network.stores if node.lifetime is not None]
         if nodes:
             fixed_nodes = [node.id for node in nodes if node.lifetime is not None and node.lifetime.chain is None]
@@ -250,20 +250,17 @@ class Lifetimes:
     def _stretch_rows(self, lifetime: WholeLifetime, layout: Layout, intervals: range) -> StretchedRows:
         period = slice(intervals.start, intervals.stop)
         rate, factor = lifetime.rate[period], lifetime.factor[:, period]
-        key = (lifetime.node.id, (rate * factor).tobytes(), layout.pieces, layout.degree)
-        if key not in self._stretch_cache:
-            self._stretch_cache[key] = StretchedRows(lifetime.chain, rate, factor, layout)
-        return self._stretch_cache[key]
+        key = ("stretched", lifetime.node.id, (rate * factor).tobytes(), layout.pieces, layout.degree)
+        return self.cache.value(key, lambda: StretchedRows(lifetime.chain, rate, factor, layout))
 
     def _chain_kernels(
         self, lifetime: WholeLifetime, layout: Layout, initial: Floats, intervals: range
     ) -> tuple[Any, Any, Floats]:
         """Return c̲ and c̄ of what leaves a chain, sparse, and what leaves of what is there at the start."""
         rate = lifetime.rate[intervals.start : intervals.stop]
-        key = (lifetime.node.id, rate.tobytes(), layout.pieces, layout.degree)
-        if key not in self._kernels:
-            self._kernels[key] = Kernel(lifetime.chain, np.repeat(rate, layout.pieces), layout.length, layout.degree)
-        kernel, count = self._kernels[key], len(intervals) * len(layout.moments)
+        key = ("kernel", lifetime.node.id, rate.tobytes(), layout.pieces, layout.degree)
+        by_piece, count = np.repeat(rate, layout.pieces), len(intervals) * len(layout.moments)
+        kernel = self.cache.value(key, lambda: Kernel(lifetime.chain, by_piece, layout.length, layout.degree))
         low, high = (sparse.csr_array(bound.reshape(count, count)) for bound in (kernel.low, kernel.high))
         return low, high, (kernel.start_outflow @ initial[lifetime.rows]).ravel()
 

@@ -21,6 +21,7 @@ is added to its constraints).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from typing import Annotated
 
@@ -30,11 +31,11 @@ from scipy import sparse
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.dynamics.supply import Supply
 from cirl_marl.environments.actuators import Actuators
-from cirl_marl.network import Floats, Network
+from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
 from cirl_marl.optimum.constraints import held_controls
-from cirl_marl.optimum.matrices import ProgramRows
+from cirl_marl.optimum.matrices import IntervalCache, Layout, ProgramRows
 from cirl_marl.optimum.program import Program, Programs
 from cirl_marl.optimum.solver import Basis, Solution, solve
 from cirl_marl.optimum.windows import (
@@ -127,29 +128,57 @@ class Future:
         admissible: what agents can do.
         network: the network, certain.
         layout: of the variables of an interval.
+        horizon: decisions of an episode, of which the network may have some, or some several times.
+        cache: rows of intervals.
     """
 
     def __init__(
-        self, admissible: Admissible, degree: int, service_weight: float | None, intervals: range | None = None
+        self,
+        admissible: Admissible,
+        degree: int,
+        service_weight: float | None,
+        like: Future | None = None,
     ) -> None:
-        """Write down what does not depend on the start; see ``Programs``."""
+        """Write down what does not depend on the start; see ``Programs``.
+
+        The network may have other numbers than that of another future and still be ``like`` it: rows that they have in
+        common are written once, and its intervals are parts of an episode (``at``).
+        """
         self.admissible = admissible
         network = self.network = admissible.lifetimes.network
-        self._programs = Programs(admissible, degree, service_weight, intervals=intervals)
-        self.layout = self._programs.layout
+        self.horizon: int = network.episode.horizon if like is None else like.horizon
+        self.cache: IntervalCache = IntervalCache() if like is None else like.cache
+        self._shift = 0
+        if like is None:
+            self._programs = Programs(admissible, degree, service_weight)
+        else:
+            admissible.lifetimes.cache = like.admissible.lifetimes.cache
+            self._programs = Programs(admissible, degree, service_weight, layout=like.layout, cache=self.cache)
+        self.layout: Layout = self._programs.layout
         self._simulator = WindowSimulator(network, admissible.agents)
         self._measure = service_measures(network, self._simulator.dynamics)
         self._weight = service_weight
         controlled = ~admissible.by_schedule & (admissible.rate[0] < admissible.rate[1]).any(axis=0)
         controlled[admissible.lifetimes.exit_arcs] = False
-        self._hold = np.flatnonzero(controlled)
+        self._hold: Integers = np.flatnonzero(controlled) if like is None else like._hold
+
+    def at(self, place: int, interval: int) -> Future:
+        """Return the same, with the network's interval ``place`` as an ``interval`` of the episode."""
+        future = copy(self)
+        future._shift = place - interval
+        return future
+
+    def _places(self, intervals: range) -> range:
+        """Return intervals of an episode as those of the network."""
+        return range(intervals.start + self._shift, intervals.stop + self._shift)
 
     def program(self, task: WindowTask, correction: Correction | None) -> Program:
         """Return the program of a task, corrected by what became of a plan before; its demand is no part of it."""
-        admissible, period = self.admissible, slice(task.intervals.start, task.intervals.stop)
-        problem = self._programs.program(task.stock, None, task.intervals)
+        places = self._places(task.intervals)
+        admissible, period = self.admissible, slice(places.start, places.stop)
+        problem = self._programs.program(task.stock, None, places)
         layout, steps = problem.layout, len(task.intervals)
-        cost = problem.cost.reshape(steps, -1) * (steps / self.network.episode.horizon)
+        cost = problem.cost.reshape(steps, -1) * (steps / self.horizon)
         if task.later is not None:
             cost += task.later.costs
         problem = replace(problem, cost=cost.ravel())
@@ -177,7 +206,7 @@ class Future:
             plan: its variables.
             task: what was planned.
         """
-        intervals, admissible, layout = task.intervals, self.admissible, problem.layout
+        intervals, admissible, layout = self._places(task.intervals), self.admissible, problem.layout
         variables = plan[: len(intervals) * layout.size].reshape(len(intervals), -1)
         actions = normalised_actions(admissible, layout, variables, task.stock, intervals)
         stocks, flows = self._simulator.run(task.stock, actions, intervals.start)
@@ -218,7 +247,7 @@ class Future:
 
     def _value(self, task: WindowTask, flows: Floats, end: Floats, levels: Floats) -> float:
         """Return the objective that the simulator reaches, in parts of that of the episode."""
-        network, share = self.network, len(flows) / self.network.episode.horizon
+        network, share = self.network, len(flows) / self.horizon
         weights = network.circularity_weights
         per_interval = flows @ weights.sum(axis=0)
         if network.objective.net_zero == "abs":
@@ -251,7 +280,7 @@ class WindowPlanner:
     def __init__(self, futures: Sequence[Future], service_weight: float | None) -> None:
         """Plan for some futures of a network."""
         self.futures, self._weight = tuple(futures), service_weight
-        network = self._network = futures[0].network
+        network, self._horizon = futures[0].network, futures[0].horizon
         self.first_price = np.full(len(network.services), FIRST_PRICE * network.objective.circularity_scale)
 
     def plan(self, task: WindowTask, basis: Basis | None, carried_out: int) -> WindowPlan:
@@ -287,7 +316,7 @@ class WindowPlanner:
         trials = [future.trial(part, solution.plan[columns], task) for future, part, columns in triples]
         merit, level = float(np.mean([t.value for t in trials])), np.mean([t.level for t in trials], axis=0)
         if task.demand is not None:
-            share = len(task.intervals) / self._network.episode.horizon
+            share = len(task.intervals) / self._horizon
             merit -= float(task.price @ np.maximum(0.0, task.demand - level)) * share
         promised = np.mean([trial.promised for trial in trials], axis=0)
         corrections = tuple(trial.correction for trial in trials)
@@ -303,8 +332,15 @@ class WindowPlanner:
         if task.demand is None or not services:
             return task, solve(problem, basis, label=label, certify=task.is_outlook)
         for rise in range(RISES + 1):
-            problem.cost[-services:] = price * (len(task.intervals) / self._network.episode.horizon)
-            solution = solve(problem, basis, label=label, certify=task.is_outlook, same_rows=same_rows)
+            problem.cost[-services:] = price * (len(task.intervals) / self._horizon)
+            solution = solve(
+                problem,
+                basis,
+                label=label,
+                certify=task.is_outlook,
+                same_rows=same_rows,
+                is_near=task.is_redrawn,
+            )
             lack, basis, same_rows = solution.plan[-services:], solution.basis, solution.basis is not None
             # what comes after was priced beside this price: another one would weigh the two differently
             has_fixed_price = task.later is not None or (task.is_redrawn and not task.is_outlook)
