@@ -15,18 +15,19 @@ from test_mpc import ORDER, in_use
 from test_optimum import certifiable
 from test_uncertain_bound import DEMAND, Paths, stockist, works
 
-from cirl_marl import CirlError, MultiAgentVectorEnv, Network, NetworkError, bound, compare
+from cirl_marl import CirlError, MultiAgentVectorEnv, Network, NetworkError, bound, compare, gradient
 from cirl_marl.controllers import Controller
 from cirl_marl.controllers.rollout import first_seed, rollout
 from cirl_marl.evaluation import calibration
 from cirl_marl.evaluation.calibration import calibrate
 from cirl_marl.network.disturbances import DisturbanceEffect, Markov
 from cirl_marl.network.processes import DisturbanceProcesses
-from cirl_marl.optimum import NoCertificate, Sampling, futures, simulate_plan
+from cirl_marl.optimum import NoCertificate, Sampling, blind, futures, simulate_plan
 from cirl_marl.optimum.blind import BestConstant, BestSchedule, Replay
 from cirl_marl.optimum.futures import future_noise
 from cirl_marl.optimum.mpc import MPC
 from cirl_marl.optimum.registry import named_controller
+from cirl_marl.optimum.schedule_ascent import ScheduleAscent, improve_schedule
 from cirl_marl.report.tradeoffs import comparison_notes
 
 Floats = NDArray[np.float64]
@@ -195,13 +196,47 @@ def test_the_best_schedule_is_near_the_bound_where_nothing_is_drawn() -> None:
 def test_blind_actions_do_not_look() -> None:
     """They are the same in all copies; a constant is the same in all intervals."""
     env = MultiAgentVectorEnv(works(4), num_envs=5)
-    for blind in (BestConstant(min_service=0.8, draws=4), BestSchedule(min_service=0.8, draws=4)):
+    for policy in (BestConstant(min_service=0.8, draws=4), BestSchedule(min_service=0.8, draws=4)):
         env.reset(seed=1)
-        blind.start(env, 0)
-        first = env.stack(blind.act({}))
+        policy.start(env, 0)
+        first = env.stack(policy.act({}))
         assert (first == first[:, :1]).all()
-        np.testing.assert_array_equal(first[:, 0], blind.actions[0])
-        assert isinstance(blind, BestSchedule) or len(np.unique(blind.actions, axis=0)) == 1
+        np.testing.assert_array_equal(first[:, 0], policy.actions[0])
+        assert isinstance(policy, BestSchedule) or len(np.unique(policy.actions, axis=0)) == 1
+
+
+@pytest.mark.medium
+def test_blind_ones_begin_with_what_others_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same margin is the same schedule, another margin a short ascent, another network a new search."""
+    ascents: list[int] = []
+
+    def counted(env: MultiAgentVectorEnv, actions: Floats, **options: Any) -> ScheduleAscent:
+        ascents.append(options["updates"])
+        return improve_schedule(env, actions, **options)
+
+    monkeypatch.setattr(blind, "improve_schedule", counted)
+    first = BestSchedule(min_service=0.8, draws=8)
+    env = MultiAgentVectorEnv(works(6), num_envs=1)
+
+    def made(controller: BestSchedule, env: MultiAgentVectorEnv) -> tuple[Floats, list[int]]:
+        ascents.clear()
+        env.reset(seed=1)
+        controller.start(env, 0)
+        return controller.actions, list(ascents)
+
+    actions, updates = made(first, env)
+    assert updates.count(blind.UPDATES) == 2  # from the constant, and from a plan
+    more, updates = made(first.with_margin(1.2), env)
+    assert updates == [blind.FEWER_UPDATES]
+    again, updates = made(first.with_margin(1.2), env)
+    assert updates == [] and again is more
+    draws = MultiAgentVectorEnv(works(6), num_envs=8)
+    levels = []
+    for schedule in (actions, more):
+        draws.reset(seed=list(range(blind.FIRST_DRAW, blind.FIRST_DRAW + 8)))
+        levels.append(gradient(draws, schedule).levels.mean())
+    assert levels[0] >= 0.8 - blind.SHORTFALL and levels[1] >= 1 - 0.2 / 1.2 - blind.SHORTFALL
+    assert blind.UPDATES in made(first, MultiAgentVectorEnv(works(5), num_envs=1))[1]
 
 
 class Shifted(Controller):
