@@ -39,7 +39,7 @@ def compare(
         int | None,
         typer.Option(help="Draws of their own on which margins are set to deliver --min-service on average."),
     ] = None,
-    futures: Annotated[int | None, typer.Option(min=1, help="Futures that scenario_mpc plans for; default: 8.")] = None,
+    futures: Annotated[int | None, typer.Option(min=1, help="Futures that scenario_mpc plans for; default: 4.")] = None,
     bounds: Annotated[bool, typer.Option(help="Whether each episode is held against the best possible.")] = True,
     bound_draws: Annotated[
         int | None, typer.Option(help="Draws of the bound for who does not foresee, which are then the episodes.")
@@ -59,9 +59,12 @@ def compare(
     price_policy one interval ahead by the prices of --bound-draws; best_constant and best_schedule do not look at all.
     """
     from cirl_marl.evaluation import compare as compared
+    from cirl_marl.evaluation.calibration import check_tuning
     from cirl_marl.report.tradeoffs import comparison_notes, comparison_table, worst_table, write_comparison
 
     names = common.comma_separated(controllers)
+    if tune is not None:
+        check_tuning(tune, min_service)
     folder, page = None if out is None else common.folder_for(out, "--out"), common.page_for(html)
     options: dict[str, Any] = {"seed": seed, "min_service": min_service, "uncertain": uncertain}
     options |= {"tune": tune, "futures": futures, "bounds": bounds and bound_draws is None}

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cirl_marl.controllers.basic import Controller
 from cirl_marl.controllers.rollout import rollout
@@ -34,6 +35,20 @@ class Calibration:
     draws: Annotated[int, "how many"]
 
 
+def check_tuning(draws: int, demand: ArrayLike | None) -> None:
+    """Refuse what no margin can be set by, before anything is computed.
+
+    Raises:
+        CirlError: for too few draws, or nothing that is demanded.
+    """
+    if draws < FEWEST:
+        raise CirlError(f"tune {draws}: too few draws to tell an expected level, at least {FEWEST}")
+    if demand is None:
+        raise CirlError("tune: give min_service, to which expected levels are tuned")
+    if not np.size(demand):
+        raise CirlError("tune: there is no service of which a level is demanded")
+
+
 def calibrate(
     env: Callable[[int], MultiAgentVectorEnv],
     controller: Callable[..., Controller],
@@ -55,10 +70,7 @@ def calibrate(
     Raises:
         CirlError: for too few draws, or nothing that is demanded.
     """
-    if draws < FEWEST:
-        raise CirlError(f"tune {draws}: too few draws to tell an expected level, at least {FEWEST}")
-    if not len(demand):
-        raise CirlError("tune: there is no service of which a level is demanded")
+    check_tuning(draws, demand)
     copies, excess = env(draws), dict[float, float]()
     margin, step = 1.0, FIRST_STEP
     for done in range(TRIES):

@@ -16,7 +16,7 @@ from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, whole_number
 from cirl_marl.evaluation.baselines import Baseline, bounds_of_draws, solve_baseline
-from cirl_marl.evaluation.calibration import CLOSE, Calibration, calibrate
+from cirl_marl.evaluation.calibration import CLOSE, Calibration, calibrate, check_tuning
 from cirl_marl.evaluation.contenders import Contender, contenders
 from cirl_marl.evaluation.episode_count import MOST_EPISODES, concatenation, enough_episodes, ties
 from cirl_marl.evaluation.figures import gain
@@ -241,8 +241,8 @@ def compare(
         run_directories, controls, variant, min_service, uncertain, futures=futures, prices=prices
     )
     demand = None if min_service is None else demanded_levels(env.network, min_service)
-    if tune is not None and demand is None:
-        raise CirlError("tune: give min_service, to which expected levels are tuned")
+    if tune is not None:
+        check_tuning(tune, demand)
     if uncertain_bound is not None:
         episodes, seed = _check_draws(uncertain_bound, env, episodes, seed), uncertain_bound.sampling.seed
     adapts, first = episodes is None and bool(env.network.disturbed), first_seed(seed)

@@ -41,8 +41,8 @@ LEVELS = (-1.0, -0.5, 0.0, 0.5, 1.0)
 """Actions with which the search for a constant begins."""
 DEGREE, ROUNDS = 1, 10
 """Of the programs of plans, and most steps by which the last of them is improved."""
-UPDATES, FEWER_UPDATES, LESS = 200, 60, 0.05
-"""Of the ascent, and where it begins with what was found for another margin; the rate of the latter."""
+UPDATES, FEWER = 200, 2
+"""Of the ascent; what part of these, and of iterations, there are where another margin's actions are begun with."""
 SHORTFALL, RISE, RISES = 5e-4, 10.0, 2
 """Expected level that may be lacking without a higher price of it; by what that is multiplied, how often at most."""
 
@@ -128,7 +128,9 @@ class BestConstant(Planner):
 
     def _best(self, env: MultiAgentVectorEnv, similar: Floats | None, progress: Callable[[float], None]) -> Floats:
         """Return the best actions, beginning with what is best for another margin, if that is known."""
-        return self._search(env, LEVELS if similar is None else (*LEVELS, similar), self.knots, progress)
+        if similar is None:
+            return self._search(env, LEVELS, self.knots, self.iterations, progress)
+        return self._search(env, (*LEVELS, similar), self.knots, self.iterations // FEWER, progress)
 
     def _demand(self, network: Network) -> Floats | None:
         """Return the expected levels that are aimed at, shape (services,)."""
@@ -145,6 +147,7 @@ class BestConstant(Planner):
         env: MultiAgentVectorEnv,
         candidates: Sequence[float | Floats],
         knots: int,
+        iterations: int,
         progress: Callable[[float], None],
     ) -> Floats:
         """Return the best actions that are found, shape (1 or steps, entries)."""
@@ -159,7 +162,7 @@ class BestConstant(Planner):
                 partial(objective_of, network, service_weight=self._weight, demand=demand, price=price),
                 knots=knots,
                 population=self._population,
-                iterations=self.iterations,
+                iterations=iterations,
                 seed=rise,
                 progress=lambda share, objective: progress(share),
             )
@@ -181,8 +184,8 @@ class BestSchedule(BestConstant):
     def _best(self, env: MultiAgentVectorEnv, similar: Floats | None, progress: Callable[[float], None]) -> Floats:
         try:
             if similar is not None:
-                return self._ascend(env, similar, FEWER_UPDATES, LESS).actions
-            constant = self._search(env, LEVELS, 1, lambda share: progress(0.3 * share))
+                return self._ascend(env, similar, UPDATES // FEWER).actions
+            constant = self._search(env, LEVELS, 1, self.iterations, lambda share: progress(0.3 * share))
             plans = sorted((self._ascend(env, plan, 0) for plan in self._plans(env)), key=self._rank(env))
             starts = [constant, *(plan.actions for plan in plans[-1:])]
             progress(0.4)
@@ -190,14 +193,14 @@ class BestSchedule(BestConstant):
         except CirlError as reason:
             self.note = f"found by search, without derivatives: {reason}"
         candidates: list[float | Floats] = [*LEVELS, *self._plans(env)] if similar is None else [similar]
-        return self._search(env, candidates, min(KNOTS, env.network.episode.horizon), progress)
+        return self._search(env, candidates, min(KNOTS, env.network.episode.horizon), self.iterations, progress)
 
-    def _ascend(self, env: MultiAgentVectorEnv, start: Floats, updates: int, rate: float = 0.2) -> ScheduleAscent:
+    def _ascend(self, env: MultiAgentVectorEnv, start: Floats, updates: int) -> ScheduleAscent:
         """Return the best schedule met on the way up from one, over the common draws."""
         draws = MultiAgentVectorEnv(env.network, num_envs=self._draws, agents=env.agents, uncertain=env.uncertain)
         draws.reset(seed=list(range(FIRST_DRAW, FIRST_DRAW + self._draws)))
         demand, weight = self._demand(env.network), self._weight
-        return improve_schedule(draws, start, min_service=demand, service_weight=weight, updates=updates, rate=rate)
+        return improve_schedule(draws, start, min_service=demand, service_weight=weight, updates=updates)
 
     def _rank(self, env: MultiAgentVectorEnv) -> Callable[[ScheduleAscent], tuple[float, float]]:
         """Return by what schedules are told apart: what they lack, then what they are worth."""

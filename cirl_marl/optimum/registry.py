@@ -27,7 +27,7 @@ PLANNERS = ("mpc", "optimum", *UNCERTAIN)
 """Controllers that plan for a demanded service."""
 TUNABLE = ("scripted", "mpc", *UNCERTAIN)
 """Controllers with a margin on what they aim at."""
-FUTURES = 8
+FUTURES = 4
 """That ``scenario_mpc`` plans for, unless another number is asked for."""
 
 
