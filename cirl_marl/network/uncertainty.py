@@ -307,17 +307,17 @@ def network_of_intervals(network: Any, intervals: Integers) -> Any:
     """
     length = network.episode.control_interval
 
-    def moved(part: Any) -> Any:
+    def part_of_intervals(part: Any) -> Any:
         series = {
             name: in_intervals(network.interval_means(value)[intervals], length) or Series(times=(0.0,), values=(0.0,))
             for name, declaration in declarations(type(part)).items()
             if isinstance(value := getattr(part, name), Series) and not getattr(declaration, "past", False)
         }
         if getattr(part, "control", None) is not None:
-            series["control"] = moved(part.control)
+            series["control"] = part_of_intervals(part.control)
         return replace(part, **series)
 
-    groups = {key: tuple(map(moved, getattr(network, key))) for key in KINDS}
+    groups = {key: tuple(map(part_of_intervals, getattr(network, key))) for key in KINDS}
     return replace(network, **groups, episode=replace(network.episode, horizon=len(intervals)), scenarios={})
 
 

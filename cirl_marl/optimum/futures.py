@@ -31,18 +31,18 @@ class DrawnFutures:
     """The futures of copies of an environment: conditional means, or several that are drawn."""
 
     def __init__(
-        self, env: MultiAgentVectorEnv, expected: Future, degree: int, service_weight: float | None, count: int | None
+        self, env: MultiAgentVectorEnv, reference: Future, degree: int, service_weight: float | None, count: int | None
     ) -> None:
         """Prepare them.
 
         Args:
             env: whose copies they are of.
-            expected: the episode in which all is as it is expected to be from the start.
+            reference: the episode in which all is as it is expected to be from the start.
             degree: of the test polynomials.
             service_weight: see ``Programs``.
             count: how many are drawn for each copy; None: one, of conditional means.
         """
-        self._env, self._expected, self._count = env, expected, count
+        self._env, self._reference, self._count = env, reference, count
         self._degree, self._weight = degree, service_weight
         network, processes = env.network, env.network.processes
         self._prior = processes.prior_means(network.episode.horizon)
@@ -81,7 +81,7 @@ class DrawnFutures:
 
     def _future(self, network: Network) -> Future:
         admissible = Admissible.of(network, self._env.agents or None)
-        return Future(admissible, self._degree, self._weight, self._expected)
+        return Future(admissible, self._degree, self._weight, self._reference)
 
     def _on_grid(self, paths: Floats, intervals: range) -> Floats:
         """Return paths over intervals, shape (intervals, names, futures), rounded after the first; see GRID."""
@@ -93,7 +93,7 @@ class DrawnFutures:
         return paths
 
     def _check_size(self, intervals: range) -> None:
-        size = (self._count or 1) * len(intervals) * self._expected.layout.size
+        size = (self._count or 1) * len(intervals) * self._reference.layout.size
         if self._count is not None and size > MOST_VARIABLES:
             name, shape = self._env.network.name, f"{self._count} futures of {len(intervals)} intervals"
             raise CirlError(
