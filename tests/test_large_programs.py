@@ -10,10 +10,12 @@ import pytest
 from scipy import sparse
 from small_networks import cycle
 
-from cirl_marl import Network, load_network
-from cirl_marl.optimum import bound, improve, improve_plan, program, reach, simulate_plan, solver
+from cirl_marl import MultiAgentVectorEnv, Network, load_network
+from cirl_marl.controllers.rollout import rollout
+from cirl_marl.optimum import bound, improve, improve_plan, program, reach, simulate_plan, solver, window_planner
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.improve import penalised_objective, prices
+from cirl_marl.optimum.mpc import MPC
 
 
 @pytest.mark.parametrize(("network", "merged"), [(load_network("steel_japan"), False), (cycle(), True)])
@@ -87,6 +89,31 @@ def test_hipo_proves_the_bound_that_the_others_prove(monkeypatch: pytest.MonkeyP
     assert tried == [solver.LARGE_SETTINGS[0]]
     assert found.basis is None
     assert found.verify().bound == pytest.approx(usual.objective, rel=solver.NEAR)
+
+
+@pytest.mark.medium
+def test_an_outlook_of_a_large_network_is_solved_twice_and_roughly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """HiPO stops there at half a percent; windows serve and come as near the bound as after a good outlook."""
+    pytest.importorskip("highspy_extras")
+    tried, run = list[solver.HighsOptions | None](), solver._ScaledProgram.run
+
+    def noted(scaled: Any, options: solver.HighsOptions | None, basis: Any, **others: Any) -> Any:
+        tried.append(options)
+        return run(scaled, options, basis, **others)
+
+    monkeypatch.setattr(solver._ScaledProgram, "run", noted)
+    reached = []
+    for size in (solver.LARGE_PROGRAM, 1000):  # of 40 intervals there are more variables, of 10 fewer
+        for module in (solver, window_planner):
+            monkeypatch.setattr(module, "LARGE_PROGRAM", size)
+        tried.clear()
+        env = MultiAgentVectorEnv("copper_net", num_envs=1, horizon=40)
+        reached.append(rollout(env, MPC(horizon=10, min_service=0.9), seed=0))
+    assert tried[:2] == [solver.ROUGH_SETTINGS] * 2
+    assert solver.ROUGH_SETTINGS not in tried[2:]
+    good, rough = reached
+    assert rough.least_service.min() > 0.9 - 2e-3
+    assert rough.episode_circularity == pytest.approx(good.episode_circularity, rel=0.01)
 
 
 def test_without_hipo_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

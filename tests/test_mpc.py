@@ -27,6 +27,9 @@ from cirl_marl.controllers.rollout import rollout
 from cirl_marl.network.elements import Lifetime
 from cirl_marl.optimum import NoCertificate, Plan, bound, envelope
 from cirl_marl.optimum.mpc import MPC
+from cirl_marl.optimum.solver import Basis
+from cirl_marl.optimum.window_planner import WindowPlanner
+from cirl_marl.optimum.windows import WindowPlan, WindowTask
 
 RESERVE = Node(id="reserve", role=Role.NONRENEWABLE_RESERVOIR, initial=(100.0, 100.0))
 USE = Node(id="use", initial=(10.0, 10.0))
@@ -73,6 +76,42 @@ def test_a_short_window_sees_what_comes_after(horizon: int) -> None:
     run = rollout(MultiAgentVectorEnv(in_use(), num_envs=1), MPC(horizon=horizon, min_service=1.0, degree=4, replan=1))
     assert run.episode_circularity[0] == pytest.approx(-6.0, rel=1e-3)
     np.testing.assert_allclose(run.service, 1.0, atol=1e-4)
+
+
+def test_what_a_window_promises_is_what_it_is_worth() -> None:
+    """Where the program is exact so is its promise, in which levels have the price of service in later years."""
+    env = MultiAgentVectorEnv(in_use(), num_envs=1)
+    env.reset(seed=0)
+    controller = MPC(horizon=3, min_service=0.9, degree=4, replan=1)
+    controller.start(env, 0)
+    plan = controller._plans[0].window
+    assert plan is not None and plan.task.later is not None
+    assert plan.task.later.costs[0, plan.problem.layout.level] < -0.1
+    assert plan.merit == pytest.approx(-plan.problem.cost @ plan.solution.plan, abs=1e-3)
+
+
+@pytest.mark.parametrize(("poor", "rounds"), [(0, 3), (5, 6), (99, 10)])
+def test_a_plan_that_falls_short_of_its_promise_is_corrected_again(
+    poor: int, rounds: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As long as corrections change, ten programs are solved while the simulator makes little of them, else three."""
+    trial, merits = WindowPlanner._trial, []
+
+    def erring(planner: WindowPlanner, task: WindowTask, basis: Basis | None) -> WindowPlan:
+        """Lose 10, less each time, in the first rounds, and never twice with the same errors."""
+        plan = trial(planner, task, basis)
+        merits.append(plan.merit - (10.0 - len(merits) if len(merits) < poor else 0.0))
+        errors = tuple(replace(item, error=item.error + 0.001 * len(merits)) for item in plan.corrections)
+        return replace(plan, merit=merits[-1], corrections=errors)
+
+    monkeypatch.setattr(WindowPlanner, "_trial", erring)
+    env = MultiAgentVectorEnv(in_use(), num_envs=1)
+    env.reset(seed=0)
+    controller = MPC(min_service=0.9, degree=4)
+    controller.start(env, 0)
+    assert len(merits) == rounds
+    plan = controller._plans[0].window
+    assert plan is not None and plan.merit == max(merits)
 
 
 def test_a_service_out_of_reach_is_approached() -> None:

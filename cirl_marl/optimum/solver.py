@@ -49,6 +49,8 @@ LARGE_SETTINGS: tuple[HighsOptions, ...] = (
 """What is tried for it. HiPO, in a package of its own, factorises where the other interior points (IPX) look for a
 basis. Below that tolerance it stagnates, and goes on as IPX does.
 """
+ROUGH_SETTINGS: HighsOptions = {**LARGE_SETTINGS[0], "kkt_tolerance": 5e-3}
+"""Tried first where prices are all that is asked for: HiPO comes as far, where it may then go on as IPX for minutes."""
 FEASIBLE = 1e-6
 """Largest amount by which the rows of a plan may be missed, relative to their largest term."""
 OPTIMAL = 1e-5
@@ -97,6 +99,7 @@ def solve(
     certify: bool = True,
     same_rows: bool = False,
     is_near: bool = False,
+    is_rough: bool = False,
 ) -> Solution:
     """Minimise cᵀv over the program.
 
@@ -111,6 +114,7 @@ def solve(
         same_rows: whether ``basis`` is of a program that differs in the cost alone.
         is_near: whether a few iterations from ``basis`` do. Then edges are weighted by reference frameworks (Devex),
             which begin at 1; steepest edges begin with as many solutions as there are rows.
+        is_rough: whether an answer to half a percent is enough for a large program.
         certify: whether multipliers must prove the answer good; else what HiGHS calls optimal is taken at its word,
             and of other answers that satisfy the rows the best.
 
@@ -121,7 +125,10 @@ def solve(
     name, answer, best, status, is_refused = problem.layout.network.name, None, math.inf, "", False
     is_large = len(problem.cost) >= LARGE_PROGRAM
     # without its package HiGHS takes another solver for HiPO
-    attempts: Sequence[HighsOptions] = LARGE_SETTINGS[0 if find_spec(EXTRA) else 1 :] if is_large else SETTINGS
+    attempts: Sequence[HighsOptions] = SETTINGS
+    if is_large:
+        rough = (ROUGH_SETTINGS,) if is_rough else ()
+        attempts = (*rough, *LARGE_SETTINGS) if find_spec(EXTRA) else LARGE_SETTINGS[1:]
     program = _ScaledProgram(problem, np.maximum(np.abs(problem.low), np.abs(problem.high)))
     for settings in (None, *attempts) if basis is not None else attempts:
         highs = program.run(settings, basis if settings is None else None, primal=same_rows, is_near=is_near)

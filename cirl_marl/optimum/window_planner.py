@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
+from functools import partial
 from typing import Annotated
 
 import numpy as np
@@ -37,7 +38,7 @@ from cirl_marl.optimum.admissible import Admissible, normalised_actions
 from cirl_marl.optimum.constraints import held_controls
 from cirl_marl.optimum.matrices import IntervalCache, Layout, ProgramRows
 from cirl_marl.optimum.program import Program, Programs
-from cirl_marl.optimum.solver import Basis, Solution, solve
+from cirl_marl.optimum.solver import LARGE_PROGRAM, Basis, Solution, solve
 from cirl_marl.optimum.windows import (
     DISTANCE,
     Continuation,
@@ -53,10 +54,12 @@ from cirl_marl.optimum.windows import (
 FIRST_PRICE, RISE, RISES = 3.0, 10.0, 8
 """The price of service that is tried first, against λ̄/circularity_scale; by what it is multiplied while more could be
 had, and how often at most."""
-SHORTFALL = 1e-6
-"""Mean level that a plan may lack of what is demanded without a higher price."""
-ROUNDS = 3
-"""Most programs for a plan, but for those with higher prices."""
+SHORTFALL, ROUGH_SHORTFALL = 1e-6, 1e-4
+"""Mean level that a plan may lack of what is demanded without a higher price; where it is solved roughly."""
+ROUNDS, MOST_ROUNDS, LARGE_ROUNDS = 3, 10, 2
+"""Most programs for a plan, but for those with higher prices: usually, while it falls short, and of large programs."""
+FALLS_SHORT = 2e-3
+"""By how much the simulator must not miss what a program promises, in λ̄/circularity_scale."""
 TOLERANCE = 2e-4
 """Level by which the intervals that are carried out may miss what is planned, in the mean, without a further round."""
 
@@ -258,6 +261,8 @@ class Future:
             value += self._weight * share * float(levels.mean()) if levels.size else 0.0
         if task.later is not None:
             value -= self._later_cost(task.later, flows, self.admissible.lifetimes.start_planned @ end)
+            if not task.is_redrawn:  # else all that lacks has its price
+                value -= float(np.sum(task.later.costs[:, self.layout.level : self.layout.imbalance] * levels))
         return value
 
     def _later_cost(self, later: Continuation, flows: Floats, end: Floats) -> float:
@@ -281,6 +286,8 @@ class WindowPlanner:
         """Plan for some futures of a network."""
         self.futures, self._weight = tuple(futures), service_weight
         network, self._horizon = futures[0].network, futures[0].horizon
+        # with a service weight the objective is in parts of the scale
+        self._scale = 1.0 if service_weight is not None else network.objective.circularity_scale
         self.first_price = np.full(len(network.services), FIRST_PRICE * network.objective.circularity_scale)
 
     def plan(self, task: WindowTask, basis: Basis | None, carried_out: int) -> WindowPlan:
@@ -289,11 +296,16 @@ class WindowPlanner:
         Raises:
             SolverFailure: if the solver fails before there is a plan.
         """
-        best = None
-        for _ in range(ROUNDS):
+        best, near = None, FALLS_SHORT * self._scale
+        for done in range(1, MOST_ROUNDS + 1):
             trial = self._trial(task, basis)
             if best is None or trial.merit > best.merit:
                 best = trial
+            promise = -float(trial.problem.cost @ trial.solution.plan)
+            is_large = len(trial.problem.cost) >= LARGE_PROGRAM  # each program starts from nothing
+            is_near = task.is_redrawn or promise - best.merit <= near
+            if (done >= ROUNDS and is_near) or (is_large and done == LARGE_ROUNDS):
+                break
             if task.corrections is not None:
                 pairs = zip(trial.corrections, task.corrections, strict=True)
                 error = np.mean(
@@ -329,30 +341,26 @@ class WindowPlanner:
             basis = None  # of a program with other rows
         label = f"the program of MPC for decisions {task.intervals.start} to {task.intervals.stop - 1}"
         services, price, least, same_rows = len(self.first_price), task.price, None, False
+        is_rough = task.is_outlook and len(problem.cost) >= LARGE_PROGRAM
+        run = partial(solve, label=label, certify=task.is_outlook and not is_rough, is_rough=is_rough)
+        shortfall = ROUGH_SHORTFALL if is_rough else SHORTFALL
         if task.demand is None or not services:
-            return task, solve(problem, basis, label=label, certify=task.is_outlook)
+            return task, run(problem, basis)
         for rise in range(RISES + 1):
             problem.cost[-services:] = price * (len(task.intervals) / self._horizon)
-            solution = solve(
-                problem,
-                basis,
-                label=label,
-                certify=task.is_outlook,
-                same_rows=same_rows,
-                is_near=task.is_redrawn,
-            )
+            solution = run(problem, basis, same_rows=same_rows, is_near=task.is_redrawn)
             lack, basis, same_rows = solution.plan[-services:], solution.basis, solution.basis is not None
             # what comes after was priced beside this price: another one would weigh the two differently
             has_fixed_price = task.later is not None or (task.is_redrawn and not task.is_outlook)
-            if lack.max() <= SHORTFALL or has_fixed_price or rise == RISES:
+            if lack.max() <= shortfall or has_fixed_price or rise == RISES:
                 break
             if least is None:
                 only_lack = replace(problem, cost=np.repeat([0.0, 1.0], [len(problem.cost) - services, services]))
-                least = solve(only_lack, basis, label=label, certify=False, same_rows=same_rows).plan[-services:].sum()
-            if lack.sum() <= least + SHORTFALL * services:
+                least = run(only_lack, basis, certify=False, same_rows=same_rows).plan[-services:].sum()
+            if lack.sum() <= least + shortfall * services:
                 break
-            price = np.where(lack > SHORTFALL, price * RISE, price)
+            price = np.where(lack > shortfall, price * RISE, price)
         if task.is_outlook:  # what turns out dearer within windows is not left undone
             multipliers = -solution.certificate.under[-services:]
-            price = np.where(lack > SHORTFALL, price, np.maximum(price, FIRST_PRICE * multipliers))
+            price = np.where(lack > shortfall, price, np.maximum(price, FIRST_PRICE * multipliers))
         return replace(task, price=price), solution

@@ -108,8 +108,11 @@ class WindowPlan:
         for matrix, multipliers in ((problem.equal, certificate.equal), (problem.under, certificate.under)):
             later = problem.interval_of_rows(matrix) >= stop
             costs -= matrix[later][:, own].T @ multipliers[later]
+        by_interval = costs.reshape(len(intervals), layout.size)
+        if self.solution.basis is None:  # multipliers that are only nearly right would pay for more than is demanded
+            by_interval[:, layout.level : layout.imbalance] = 0.0
         ends = self.solution.plan[(stop - 1) * layout.size : stop * layout.size][layout.last]
-        return Continuation(costs.reshape(len(intervals), layout.size), np.maximum(ends, 0.0))
+        return Continuation(by_interval, np.maximum(ends, 0.0))
 
 
 def level_columns(problem: Program) -> Integers:
