@@ -95,7 +95,7 @@ def test_a_plan_that_falls_short_of_its_promise_is_corrected_again(
     poor: int, rounds: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As long as corrections change, ten programs are solved while the simulator makes little of them, else three."""
-    trial, merits = WindowPlanner._trial, []
+    trial, merits = WindowPlanner._trial, list[float]()
 
     def erring(planner: WindowPlanner, task: WindowTask, basis: Basis | None) -> WindowPlan:
         """Lose 10, less each time, in the first rounds, and never twice with the same errors."""
