@@ -131,7 +131,8 @@ class Training:
     def _service_multiplier(self, checkpoint: Path | None) -> ServiceMultiplier | None:
         """Return the multiplier of the service if it moves, at the value that a checkpoint has."""
         settings = self.config.recipe.run
-        if not settings.price_rate or settings.min_service is None or not self.env.network.services:
+        by_evaluations = bool(settings.price_rate) and settings.engine != "gradients"
+        if not by_evaluations or settings.min_service is None or not self.env.network.services:
             return None
         if self.env.reward_mode not in CIRCULARITY_REWARDS:
             raise RecipeError(
@@ -358,9 +359,8 @@ def run_together(
     members = [learner for training in trainings for learner in training.stackable(callbacks)]
     run_settings = trainings[0].config.recipe.run
     if run_settings.engine == "gradients":
-        stacks_of_learners = gradient_stacks(
-            [(training.learners.values(), run_settings.min_service) for training in trainings], device
-        )
+        by_training = [training.learners.values() for training in trainings]
+        stacks_of_learners = gradient_stacks(by_training, device, run_settings)
     else:
         stacks_of_learners = stacks(members, device)
     member_ids = {id(learner) for learner in members}

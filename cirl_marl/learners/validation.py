@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import RunError
 from cirl_marl.learners.policies import Policies
+from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.records.files import read_record, write_json
 
@@ -83,36 +85,45 @@ LARGEST_MULTIPLIER = 1e3
 """Largest value of the multiplier."""
 
 
+def moved_price(
+    lasting: ArrayLike, service: ArrayLike, min_service: float, rate: float, damping: float, least: ArrayLike
+) -> tuple[Floats, Floats]:
+    """Return q and p after levels ``service``.
+
+    The shortfall counts at most as what may lack at all::
+
+        e = clip((s* − s)/(1 − s*), −1, 1),    q ← q · exp(rate · e),    p = q · exp(damping · e)
+
+    The logarithms move, so that steps are the same whatever a unit of service is worth; q and p stay above ``least``.
+    """
+    room = max(1.0 - min_service, 1.0 / LARGEST_MULTIPLIER)
+    error = np.clip((min_service - np.asarray(service)) / room, -1.0, 1.0)
+    lasting = np.clip(lasting * np.exp(rate * error), least, LARGEST_MULTIPLIER)
+    return lasting, np.clip(lasting * np.exp(damping * error), least, LARGEST_MULTIPLIER)
+
+
 class ServiceMultiplier:
     """The Lagrange multiplier p of the demanded service: what a shortfall costs in units of circularity.
 
     The reward is w·λ/c − (1 − w)·shortfall, so that p = (1 − w)/w. The demanded level s* is a constraint and p its
     multiplier (Altman 1999, Constrained Markov Decision Processes), moved by a controller with an integral and a
-    proportional part (Stooke et al. 2020, arXiv 2007.03964). After a validation with the lower bound s of every
-    service::
-
-        e = clip((s* − s)/(1 − s*), −1, 1),    q ← q · exp(rate · e),    p = q · exp(damping · e)
-
-    but neither falls below what p was at first, where learners that serve more than is demanded would give up at once
-    what takes them long to learn. Where one more unit of service costs about the same over a wide range, learners
-    drift through it at any other price, and only the damping, which is at once, stops them.
+    proportional part (Stooke et al. 2020, arXiv 2007.03964): ``moved_price`` after a validation, with the lower bound
+    of every service. Neither q nor p falls below what p was at first, where learners that serve more than is demanded
+    would give up at once what takes them long to learn. Where one more unit costs about the same over a wide range,
+    they drift through it at any other price, and only the damping, which is at once, stops them.
     """
 
-    def __init__(self, env: MultiAgentVectorEnv, min_service: float, rate: float, damping_gain: float) -> None:
+    def __init__(self, env: MultiAgentVectorEnv, min_service: float, rate: float, damping: float) -> None:
         """Begin with the weight that ``env`` has."""
-        self._env, self._min_service, self._rate, self._damping_gain = env, min_service, rate, damping_gain
+        self._env, self._min_service, self._rate, self._damping = env, min_service, rate, damping
         weight = max(env.circularity_weight, 1.0 / (1.0 + LARGEST_MULTIPLIER))
         self._least = self._integral = (1.0 - weight) / weight
 
     def update(self, service: float) -> None:
         """Move the multiplier after a validation."""
-        room = max(1.0 - self._min_service, 1.0 / LARGEST_MULTIPLIER)
-        error = np.clip((self._min_service - service) / room, -1.0, 1.0)
-        self._integral = self._within(self._integral * np.exp(self._rate * error))
-        self._env.circularity_weight = 1.0 / (1.0 + self._within(self._integral * np.exp(self._damping_gain * error)))
-
-    def _within(self, price: float) -> float:
-        return float(np.clip(price, self._least, LARGEST_MULTIPLIER))
+        moved = moved_price(self._integral, service, self._min_service, self._rate, self._damping, least=self._least)
+        self._integral, price = (float(part) for part in moved)
+        self._env.circularity_weight = 1.0 / (1.0 + price)
 
     def save(self, folder: Path) -> None:
         """Write the weight and the integral part to a checkpoint."""

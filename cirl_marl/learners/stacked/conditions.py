@@ -16,7 +16,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtr
 
 from cirl_marl.learners.learner import Learner
 from cirl_marl.learners.policies import CentralCriticPolicy
-from cirl_marl.learners.recipe import LearnerSettings
+from cirl_marl.learners.recipe import LearnerSettings, Run
 from cirl_marl.learners.stacked.gradient_ascent import GradientStack
 from cirl_marl.learners.stacked.on_policy import RolloutStack
 from cirl_marl.learners.stacked.perceptrons import ACTIVATIONS, linear_layers
@@ -28,9 +28,9 @@ OPTIMISERS = (torch.optim.Adam, torch.optim.AdamW, torch.optim.RMSprop, torch.op
 EXTRACTORS = {ActorCriticPolicy: FlattenExtractor, CentralCriticPolicy: CombinedExtractor}
 
 
-def gradient_stacks(trainings: Iterable[tuple[Iterable[Learner], float | None]], device: str) -> list[Stack]:
-    """Return the learners of each training as one, which climb exact gradients; with the service that it demands."""
-    return [GradientStack([*learners], device, min_service) for learners, min_service in trainings]
+def gradient_stacks(trainings: Iterable[Iterable[Learner]], device: str, run: Run) -> list[Stack]:
+    """Return the learners of each training as one, which climb exact gradients as the recipe's ``run`` says."""
+    return [GradientStack([*learners], device, run) for learners in trainings]
 
 
 def gradient_obstacle(learner: Learner, settings: LearnerSettings) -> str | None:

@@ -2,16 +2,18 @@
 
 With K copies, prices p_s and mean levels l_s the stack of all agents of an environment maximises ::
 
-    mean over copies of  λ̄/c + Σ_s p_s·l_s,    p_s ← max(0, p_s + r·(e_s + d·Δe_s)),    e_s = demanded level − l_s,
+    mean over copies of  λ̄/c + Σ_s p_s·l_s,
 
-c the circularity scale: dual ascent on the price of each service. An episode is played, and gone through backwards
-(``Derivatives``): what an action is worth goes into the policy that took it and, by what that saw, into what came
-before. Nobody sees more than its own observation. Outputs are clipped to their bounds; where one lies beyond, only what
-leads back counts, as if the clip were not there (straight-through).
+c the circularity scale. The price of each service is a multiplier that moves after every episode (``moved_price``), so
+that an evaluation, of as many episodes as the recipe says, assures what is demanded. An episode is played, and gone
+through backwards (``Derivatives``): what an action is worth goes into the policy that took it and, by what that saw,
+into what came before. Nobody sees more than its own observation. Outputs are clipped to their bounds; where one lies
+beyond, only what leads back counts, as if the clip were not there (straight-through).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
@@ -26,27 +28,24 @@ from cirl_marl.environments.derivatives import Derivatives, Outputs
 from cirl_marl.environments.state import Interval, State
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.learners.learner import Learner
+from cirl_marl.learners.recipe import Run
 from cirl_marl.learners.stacked.perceptrons import Weights, chain, write_gradients
 from cirl_marl.learners.stacked.stack import Stack
+from cirl_marl.learners.validation import QUANTILE_95, moved_price
 from cirl_marl.network import Floats
 
-RATE, DAMPING = 2.0, 10.0
-"""r and d of the dual ascent."""
-SPREAD, MIDDLE = 10.0, 0.5
-"""Observations are scaled, most of them between 0 and 1: fresh weights of the first layer are so many times as large
-and centred there, so that hidden units tell apart what differs by a tenth."""
-MARGIN = 5e-4
-"""How much more than ``min_service`` is asked for, so that an evaluation assures it."""
+LEAST_PRICE = 1e-4
+"""Below which no price falls, per circularity scale."""
 
 
 class GradientStack(Stack):
     """All agents of one environment, whose policies are those of PPO; their critics and deviations stay as they are."""
 
-    def __init__(self, members: Sequence[Learner], device: str, min_service: float | None) -> None:
-        """Take over parameters, optimisers and counters of the learners; ``min_service`` is asked of every service."""
+    def __init__(self, members: Sequence[Learner], device: str, run: Run) -> None:
+        """Take over parameters, optimisers and counters of the learners; ``run`` says what is asked of services."""
         super().__init__(members, device)
         self._env: MultiAgentVectorEnv = members[0].agent_env.views[0].env
-        self._derivatives, self._min_service = Derivatives(self._env), min_service
+        self._derivatives, self._run = Derivatives(self._env), run
         self._timesteps, self._updates = self._models[0].num_timesteps, self._models[0]._n_updates
         inputs, policies = self._inputs, [model.policy for model in self._models]
         self._weights = Weights(policies, inputs.actor_columns, inputs.critic_columns, self._device)
@@ -54,20 +53,10 @@ class GradientStack(Stack):
         names = [member.name for member in members]
         self._observed = [self._env.layout.slices[name] for name in names]
         self._acted = [self._env.actuators.entries[name] for name in names]
-        if not self._timesteps and members[0].spec.start is None and members[0].normaliser is None:
-            self._spread()
-        services = self._env.network.services
-        weight = self._env.circularity_weight
-        stated = np.array([service.weight for service in services]) * (1.0 - weight) / max(weight, 1e-6)
-        self._prices: Floats = getattr(self._models[0], "service_prices", stated)
-        self._lacks: Floats = getattr(self._models[0], "service_lacks", np.zeros(len(services)))
-
-    def _spread(self) -> None:
-        """Let hidden units differ over the range of what is observed."""
-        first = self._weights.actor.layers[0]
-        first.weight.mul_(SPREAD)
-        if first.bias is not None:
-            first.bias.sub_(MIDDLE * first.weight.sum(dim=2))
+        first, weight = self._models[0], max(self._env.circularity_weight, 1e-6)
+        stated = np.array([service.weight for service in self._env.network.services]) * (1.0 - weight) / weight
+        self._prices: Floats = getattr(first, "service_prices", stated)
+        self._lasting: Floats = getattr(first, "lasting_prices", np.maximum(stated, LEAST_PRICE))
 
     def learn(self, steps: int) -> None:
         """Learn for the share of ``steps`` that is the learners'."""
@@ -88,7 +77,7 @@ class GradientStack(Stack):
     def _keep_progress(self) -> None:
         """Leave with the first model what a resumed training needs beside it: prices, and where the episode begins."""
         first = self._models[0]
-        first.service_prices, first.service_lacks = self._prices, self._lacks
+        first.service_prices, first.lasting_prices = self._prices, self._lasting
         if not self._is_restoring:
             first.episode_start = asdict(self._env.physical)
 
@@ -149,9 +138,9 @@ class GradientStack(Stack):
         weights.clip(self._models[0].max_grad_norm)
         weights.optimiser.step()
         self._updates += 1
-        levels = (after.service / length).mean(axis=1)
+        levels = after.service / length
         self._move_prices(levels)
-        self._log(float(after.circularity.mean()) / length, levels, rate)
+        self._log(float(after.circularity.mean()) / length, levels.mean(axis=1), rate)
 
     def _by_output(self, by_action: Floats, outputs: Tensor) -> Tensor:
         """Return the loss's gradient by the outputs, shape (N, B, actions): minus that of what is maximised."""
@@ -163,11 +152,19 @@ class GradientStack(Stack):
         return torch.as_tensor(gradient, device=self._device)
 
     def _move_prices(self, levels: Floats) -> None:
-        if self._min_service is None:
+        """Move them by what an evaluation would assure whose episodes are like these, levels of shape (services, B)."""
+        run = self._run
+        if run.min_service is None:
             return
-        lacks = self._min_service + MARGIN - levels
-        change = RATE * (lacks + DAMPING * (lacks - self._lacks) * (self._updates > 1))
-        self._prices, self._lacks = np.maximum(self._prices + change, 0.0), lacks
+        uncertain = QUANTILE_95 * levels.std(axis=1) / math.sqrt(run.episodes)
+        self._lasting, self._prices = moved_price(
+            self._lasting,
+            levels.mean(axis=1) - uncertain,
+            run.min_service,
+            run.price_rate,
+            run.price_damping,
+            LEAST_PRICE,
+        )
 
     def _log(self, circularity: float, levels: Floats, rate: float) -> None:
         """Log the figures of an update for each learner with a logger."""
