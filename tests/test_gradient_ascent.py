@@ -10,6 +10,7 @@ import torch
 
 from cirl_marl import RecipeError, train
 from cirl_marl.learners.recipe import LearnerSettings, Recipe, Run
+from cirl_marl.learners.stacked import gradient_ascent
 from cirl_marl.learners.stacked.gradient_ascent import GradientStack
 
 PARAMETERS = {"policy_kwargs": {"net_arch": [4]}, "max_grad_norm": 1e9, "n_steps": 4, "batch_size": 8}
@@ -29,8 +30,12 @@ def recipe(run: dict[str, Any] | None = None, **learner: Any) -> Recipe:
     )
 
 
-def test_gradients_go_through_the_policies(monkeypatch: pytest.MonkeyPatch) -> None:
-    """They are those of the mean of λ̄/c plus priced levels over the copies, by every weight of every policy."""
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_gradients_go_through_the_policies(monkeypatch: pytest.MonkeyPatch, share: float) -> None:
+    """They are those of the mean of λ̄/c plus priced levels over the copies, by every weight of every policy.
+
+    A share of them comes from episodes whose policies see so much of what changed.
+    """
     ascend, checked = GradientStack._ascend, []
 
     def check(stack: GradientStack, progress_remaining: float) -> None:
@@ -55,7 +60,7 @@ def test_gradients_go_through_the_policies(monkeypatch: pytest.MonkeyPatch) -> N
                     change = np.zeros(inputs.shape)
                     for rows, span in zip(change, stack._observed, strict=True):
                         rows[:, : span.stop - span.start] = (seen[span] - before[span]).T
-                    inputs = tape[t + 1][1][0] + torch.as_tensor(change * tape[t + 1][2], dtype=torch.float32)
+                    inputs = tape[t + 1][1][0] + torch.as_tensor(share * change * tape[t + 1][2], dtype=torch.float32)
             state = env.physical
             value = state.circularity.mean() / env.network.objective.circularity_scale
             return float(value + prices @ state.service.mean(axis=1)) / len(tape)
@@ -74,6 +79,7 @@ def test_gradients_go_through_the_policies(monkeypatch: pytest.MonkeyPatch) -> N
         checked.append(largest)
 
     monkeypatch.setattr(GradientStack, "_ascend", check)
+    monkeypatch.setattr(gradient_ascent, "FEEDBACK", share)
     train("carbo_net", recipe({"steps": 8}))
     assert len(checked) == 1 and checked[0] > 0
 

@@ -6,9 +6,9 @@ With K copies, prices p_s and mean levels l_s the stack of all agents of an envi
 
 c the circularity scale. The price of each service is a multiplier that moves after every episode (``moved_price``), so
 that an evaluation, of as many episodes as the recipe says, assures what is demanded. An episode is played, and gone
-through backwards (``Derivatives``): what an action is worth goes into the policy that took it and, by what that saw,
-into what came before. Nobody sees more than its own observation. Outputs are clipped to their bounds; where one lies
-beyond, only what leads back counts, as if the clip were not there (straight-through).
+through backwards (``Derivatives``): what an action is worth goes into the policy that took it and, by what that saw, a
+share of it (``FEEDBACK``) into what came before. Nobody sees more than its own observation. Outputs are clipped to
+their bounds; where one lies beyond, only what leads back counts, as if the clip were not there (straight-through).
 """
 
 from __future__ import annotations
@@ -34,6 +34,10 @@ from cirl_marl.learners.stacked.stack import Stack
 from cirl_marl.learners.validation import QUANTILE_95, moved_price
 from cirl_marl.network import Floats
 
+FEEDBACK = 0.5
+"""Share of a derivative that passes on to what was before through what a policy saw: where agents act on each other
+round the network it would grow from interval to interval without bound. Where each acts as well as it can, what its
+action is worth is zero, and so is what is left out."""
 LEAST_PRICE = 1e-4
 """Below which no price falls, per circularity scale."""
 
@@ -131,7 +135,7 @@ class GradientStack(Stack):
             gradients.insert(0, chain(weights.actor, values, self._by_output(by_action, values[-1])))
             by_input = gradients[0][0].cpu().numpy() * slopes
             for rows, span in zip(by_input, self._observed, strict=True):
-                seen[span] = -rows[:, : span.stop - span.start].T
+                seen[span] = -FEEDBACK * rows[:, : span.stop - span.start].T
         write_gradients(weights.actor, [values for _, values, _ in self._tape], gradients)
         rate = self._models[0].lr_schedule(progress_remaining)
         update_learning_rate(weights.optimiser, rate)
@@ -152,19 +156,16 @@ class GradientStack(Stack):
         return torch.as_tensor(gradient, device=self._device)
 
     def _move_prices(self, levels: Floats) -> None:
-        """Move them by what an evaluation would assure whose episodes are like these, levels of shape (services, B)."""
+        """Move them by what nineteen of twenty evaluations assure whose episodes are like these.
+
+        ``levels`` have shape (services, B).
+        """
         run = self._run
         if run.min_service is None:
             return
-        uncertain = QUANTILE_95 * levels.std(axis=1) / math.sqrt(run.episodes)
-        self._lasting, self._prices = moved_price(
-            self._lasting,
-            levels.mean(axis=1) - uncertain,
-            run.min_service,
-            run.price_rate,
-            run.price_damping,
-            LEAST_PRICE,
-        )
+        doubt = 2.0 * QUANTILE_95 * levels.std(axis=1) / math.sqrt(run.episodes)
+        at_once = (self._lasting, levels.mean(axis=1) - doubt, run.min_service, run.price_rate, run.price_damping)
+        self._lasting, self._prices = moved_price(*at_once, least=LEAST_PRICE)
 
     def _log(self, circularity: float, levels: Floats, rate: float) -> None:
         """Log the figures of an update for each learner with a logger."""
