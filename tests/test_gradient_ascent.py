@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from cirl_marl import RecipeError, train
+from cirl_marl import RecipeError, load_network, train
 from cirl_marl.learners.recipe import LearnerSettings, Recipe, Run
 from cirl_marl.learners.stacked import gradient_ascent
 from cirl_marl.learners.stacked.gradient_ascent import GradientStack
@@ -82,6 +82,27 @@ def test_gradients_go_through_the_policies(monkeypatch: pytest.MonkeyPatch, shar
     monkeypatch.setattr(gradient_ascent, "FEEDBACK", share)
     train("carbo_net", recipe({"steps": 8}))
     assert len(checked) == 1 and checked[0] > 0
+
+
+def test_each_service_has_a_price(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its logarithm moves by what an evaluation would lack of it, and what follows is paid at that price."""
+    move, errors = GradientStack._move_prices, list[np.ndarray]()
+    model: list[Any] = []
+
+    def watch(stack: GradientStack, levels: np.ndarray) -> None:
+        move(stack, levels)
+        lower = levels.mean(axis=1) - 2 * 1.645 * levels.std(axis=1) / 3  # of nine episodes
+        errors.append(np.clip((0.9 - lower) / 0.1, -1, 1))
+        model[:] = [stack._models[0], stack._prices]
+
+    monkeypatch.setattr(GradientStack, "_move_prices", watch)
+    asked = {"steps": 40, "evaluations": 1, "episodes": 9, "min_service": 0.9, "price_rate": 0.3, "price_damping": 0.7}
+    train("carbo_net", recipe(asked), circularity_weight=0.8)
+    assert len(errors) == 5 and np.abs(errors).max() > 0
+    stated = np.array([0.25 * service.weight for service in load_network("carbo_net").services])
+    prices = stated * np.exp(0.3 * np.sum(errors, axis=0) + 0.7 * errors[-1])
+    np.testing.assert_allclose(model[1], prices, rtol=1e-12)
+    np.testing.assert_allclose(model[0].price_integrals, stated * np.exp(0.3 * np.sum(errors[:-1], axis=0)), rtol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -85,8 +85,8 @@ LARGEST_MULTIPLIER = 1e3
 """Largest value of the multiplier."""
 
 
-def moved_price(
-    lasting: ArrayLike, service: ArrayLike, min_service: float, rate: float, damping: float, least: ArrayLike
+def price_step(
+    integral: ArrayLike, service: ArrayLike, min_service: float, rate: float, damping_gain: float, least: ArrayLike
 ) -> tuple[Floats, Floats]:
     """Return q and p after levels ``service``.
 
@@ -98,8 +98,8 @@ def moved_price(
     """
     room = max(1.0 - min_service, 1.0 / LARGEST_MULTIPLIER)
     error = np.clip((min_service - np.asarray(service)) / room, -1.0, 1.0)
-    lasting = np.clip(lasting * np.exp(rate * error), least, LARGEST_MULTIPLIER)
-    return lasting, np.clip(lasting * np.exp(damping * error), least, LARGEST_MULTIPLIER)
+    integral = np.clip(integral * np.exp(rate * error), least, LARGEST_MULTIPLIER)
+    return integral, np.clip(integral * np.exp(damping_gain * error), least, LARGEST_MULTIPLIER)
 
 
 class ServiceMultiplier:
@@ -107,21 +107,23 @@ class ServiceMultiplier:
 
     The reward is w·λ/c − (1 − w)·shortfall, so that p = (1 − w)/w. The demanded level s* is a constraint and p its
     multiplier (Altman 1999, Constrained Markov Decision Processes), moved by a controller with an integral and a
-    proportional part (Stooke et al. 2020, arXiv 2007.03964): ``moved_price`` after a validation, with the lower bound
+    proportional part (Stooke et al. 2020, arXiv 2007.03964): ``price_step`` after a validation, with the lower bound
     of every service. Neither q nor p falls below what p was at first, where learners that serve more than is demanded
     would give up at once what takes them long to learn. Where one more unit costs about the same over a wide range,
     they drift through it at any other price, and only the damping, which is at once, stops them.
     """
 
-    def __init__(self, env: MultiAgentVectorEnv, min_service: float, rate: float, damping: float) -> None:
+    def __init__(self, env: MultiAgentVectorEnv, min_service: float, rate: float, damping_gain: float) -> None:
         """Begin with the weight that ``env`` has."""
-        self._env, self._min_service, self._rate, self._damping = env, min_service, rate, damping
+        self._env, self._min_service, self._rate, self._damping_gain = env, min_service, rate, damping_gain
         weight = max(env.circularity_weight, 1.0 / (1.0 + LARGEST_MULTIPLIER))
         self._least = self._integral = (1.0 - weight) / weight
 
     def update(self, service: float) -> None:
         """Move the multiplier after a validation."""
-        moved = moved_price(self._integral, service, self._min_service, self._rate, self._damping, least=self._least)
+        moved = price_step(
+            self._integral, service, self._min_service, self._rate, self._damping_gain, least=self._least
+        )
         self._integral, price = (float(part) for part in moved)
         self._env.circularity_weight = 1.0 / (1.0 + price)
 

@@ -4,7 +4,7 @@ With K copies, prices p_s and mean levels l_s the stack of all agents of an envi
 
     mean over copies of  λ̄/c + Σ_s p_s·l_s,
 
-c the circularity scale. The price of each service is a multiplier that moves after every episode (``moved_price``), so
+c the circularity scale. The price of each service is a multiplier that moves after every episode (``price_step``), so
 that an evaluation, of as many episodes as the recipe says, assures what is demanded. An episode is played, and gone
 through backwards (``Derivatives``): what an action is worth goes into the policy that took it and, by what that saw, a
 share of it (``FEEDBACK``) into what came before. Nobody sees more than its own observation. Outputs are clipped to
@@ -31,7 +31,7 @@ from cirl_marl.learners.learner import Learner
 from cirl_marl.learners.recipe import Run
 from cirl_marl.learners.stacked.perceptrons import Weights, chain, write_gradients
 from cirl_marl.learners.stacked.stack import Stack
-from cirl_marl.learners.validation import QUANTILE_95, moved_price
+from cirl_marl.learners.validation import QUANTILE_95, price_step
 from cirl_marl.network import Floats
 
 FEEDBACK = 0.5
@@ -60,7 +60,7 @@ class GradientStack(Stack):
         first, weight = self._models[0], max(self._env.circularity_weight, 1e-6)
         stated = np.array([service.weight for service in self._env.network.services]) * (1.0 - weight) / weight
         self._prices: Floats = getattr(first, "service_prices", stated)
-        self._lasting: Floats = getattr(first, "lasting_prices", np.maximum(stated, LEAST_PRICE))
+        self._integrals: Floats = getattr(first, "price_integrals", np.maximum(stated, LEAST_PRICE))
 
     def learn(self, steps: int) -> None:
         """Learn for the share of ``steps`` that is the learners'."""
@@ -81,7 +81,7 @@ class GradientStack(Stack):
     def _keep_progress(self) -> None:
         """Leave with the first model what a resumed training needs beside it: prices, and where the episode begins."""
         first = self._models[0]
-        first.service_prices, first.lasting_prices = self._prices, self._lasting
+        first.service_prices, first.price_integrals = self._prices, self._integrals
         if not self._is_restoring:
             first.episode_start = asdict(self._env.physical)
 
@@ -164,8 +164,8 @@ class GradientStack(Stack):
         if run.min_service is None:
             return
         doubt = 2.0 * QUANTILE_95 * levels.std(axis=1) / math.sqrt(run.episodes)
-        at_once = (self._lasting, levels.mean(axis=1) - doubt, run.min_service, run.price_rate, run.price_damping)
-        self._lasting, self._prices = moved_price(*at_once, least=LEAST_PRICE)
+        at_once = (self._integrals, levels.mean(axis=1) - doubt, run.min_service, run.price_rate, run.price_damping)
+        self._integrals, self._prices = price_step(*at_once, least=LEAST_PRICE)
 
     def _log(self, circularity: float, levels: Floats, rate: float) -> None:
         """Log the figures of an update for each learner with a logger."""
