@@ -1,9 +1,11 @@
 """What policies reach that do not know the future, held against the bound for them and against perfect information.
 
-python -m benchmarks.foresight [NETWORK ...]   # measures worlds of benchmarks.uncertain, and writes the table
-python -m benchmarks.foresight --table         # writes the table of what is kept in results/foresight.json
+python -m benchmarks.foresight [NETWORK ...]            # bounds worlds of benchmarks.uncertain, and who acts there
+python -m benchmarks.foresight paper_city --only mpc    # measures some; what is known of others stays
+python -m benchmarks.foresight --table                  # writes the table of what is kept in results/foresight.json
 
-Who acts, and the knobs, are those of ``benchmarks.uncertain``; the draws are others than those knobs were set on.
+Each contender has a knob, which is set on draws of its own so that the lowest expected service is what is demanded; all
+figures are of the draws of the bound, or of the first of them. Bounds are kept in results/bounds and used again.
 """
 
 from __future__ import annotations
@@ -12,81 +14,202 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from benchmarks.document import measured_table, write_sections
-from benchmarks.uncertain import DEMANDED, WORLDS, World, contenders, entries
+from benchmarks.uncertain import CLOSE, DEMANDED, WORLDS, World, entries
 from benchmarks.uncertain import RESULTS as KNOBS
-from cirl_marl import MultiAgentVectorEnv, bound, load_network
+from benchmarks.uncertain import contenders as simple_contenders
+from cirl_marl import MultiAgentVectorEnv, Network, bound, load_network
+from cirl_marl.controllers import Controller
 from cirl_marl.controllers.rollout import first_seed, rollout
-from cirl_marl.evaluation.statistics import over_episodes
+from cirl_marl.definitions.writer import fingerprint
+from cirl_marl.evaluation.calibration import calibrate
+from cirl_marl.evaluation.statistics import over_episodes, worst_mean
 from cirl_marl.optimum.draw_proofs import Sampling
+from cirl_marl.optimum.draws import Prices
+from cirl_marl.optimum.mpc import MPC
+from cirl_marl.optimum.registry import controllers_by_margin
 from cirl_marl.optimum.uncertain_bound import UncertainBound
-from cirl_marl.records.files import write_json
+from cirl_marl.records.files import write_atomically, write_json
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "uncertainty.md"
 RESULTS = Path(__file__).parent / "results" / "foresight.json"
+BOUNDS = Path(__file__).parent / "results" / "bounds"
+WINDOW, FUTURES = 3, 4
+"""Decisions that MPC looks ahead, and futures that scenario MPC plans for."""
+SIMPLE = ("neutral", "plan", "rule")
+"""Contenders of ``benchmarks.uncertain``, whose knobs are set there."""
+PLANNERS = ("mpc", "scenario_mpc", "price_policy")
+"""Contenders that solve a program for every decision, of which fewer episodes are measured."""
+BY_DRAW, PRICES = (
+    ("values", "informed_values", "luck", "informed_luck", "gross_mass"),
+    ("prices", "informed_prices"),
+)
+"""What is kept of a bound."""
+NOTICEABLE = 0.1
+"""Least processor time of a decision that is told, ms."""
+Maker = Callable[..., Controller]
 
 
-def measured(world: World, sampling: Sampling) -> dict[str, Any]:
-    """Return the figures of a world."""
-    network, began = load_network(world.network).scenario(world.scenario), time.process_time()
+def _simple(name: str, world: World, found: UncertainBound) -> Maker:
+    """Return a contender of ``benchmarks.uncertain``."""
+    controller = simple_contenders(world, found.network)[name]
+    return lambda margin: controller(margin)
+
+
+CONTENDERS: Mapping[str, Callable[[World, UncertainBound], Maker]] = {
+    **{name: partial(_simple, name) for name in SIMPLE},
+    "best_constant": lambda world, found: controllers_by_margin("best_constant", min_service=DEMANDED),
+    "best_schedule": lambda world, found: controllers_by_margin("best_schedule", min_service=DEMANDED),
+    "mpc": lambda world, found: partial(MPC, min_service=DEMANDED, horizon=WINDOW),
+    "scenario_mpc": lambda world, found: partial(MPC, min_service=DEMANDED, horizon=WINDOW, futures=FUTURES),
+    "price_policy": lambda world, found: partial(MPC, min_service=DEMANDED, prices=found.prices),
+}
+"""Who acts, by name: what makes a controller with a ``margin`` in a world, given its bound."""
+
+
+def proof(world: World, sampling: Sampling) -> tuple[UncertainBound, float]:
+    """Return the bound of a world without its certificates, and the processor time that it took, s.
+
+    It is kept in a file, for contenders that come later.
+    """
+    network = load_network(world.network).scenario(world.scenario)
+    path, question = BOUNDS / f"{world.network}.npz", f"{fingerprint(network)} {DEMANDED} {sampling}"
+    if path.is_file():
+        with np.load(path) as arrays:
+            if str(arrays["question"]) == question:
+                return _kept(network, sampling, arrays), float(arrays["seconds"])
+    began = time.process_time()
     found = bound(network, min_service=DEMANDED, degree=1, uncertain=sampling)
-    figures: dict[str, Any] = {
+    seconds = time.process_time() - began
+    _keep(path, found, question=np.array(question), seconds=np.array(seconds))
+    return found, seconds
+
+
+def _keep(path: Path, found: UncertainBound, **about: Any) -> None:
+    arrays = {name: getattr(found, name) for name in BY_DRAW} | about
+    for name in PRICES:
+        arrays |= {f"{name}.{part.name}": getattr(getattr(found, name), part.name) for part in fields(Prices)}
+    BOUNDS.mkdir(exist_ok=True)
+
+    def write(place: Path) -> None:
+        with place.open("wb") as file:
+            np.savez_compressed(file, **arrays)
+
+    write_atomically(path, write)
+
+
+def _kept(network: Network, sampling: Sampling, arrays: Mapping[str, Any]) -> UncertainBound:
+    prices = {name: Prices(**{part.name: arrays[f"{name}.{part.name}"] for part in fields(Prices)}) for name in PRICES}
+    return UncertainBound(
+        network=network,
+        agents=MultiAgentVectorEnv(network, num_envs=1).agents,
+        initial=None,
+        degree=1,
+        sampling=sampling,
+        min_service=prices["prices"].demand,
+        certificates=(),
+        prices=prices["prices"],
+        informed_prices=prices["informed_prices"],
+        **{name: arrays[name] for name in BY_DRAW},
+    )
+
+
+def bound_figures(found: UncertainBound, seconds: float) -> dict[str, Any]:
+    """Return the figures of a bound."""
+    return {
         "bound": found.value,
         "half_width": found.half_width / found.scale,
         "perfect_information": found.perfect_information,
-        "draws": sampling.draws,
-        "fit_draws": sampling.fit_draws,
-        "seconds": time.process_time() - began,
-        "unit": network.mass_unit,
+        "draws": found.sampling.draws,
+        "fit_draws": found.sampling.fit_draws,
+        "seconds": seconds,
+        "unit": found.network.mass_unit,
     }
-    sys.stdout.write(f"{found}: {figures}\n")
-    return {**figures, "contenders": dict(_gaps(world, found))}
 
 
-def _gaps(world: World, found: UncertainBound) -> Iterator[tuple[str, Any]]:
-    knobs = json.loads(KNOBS.read_text())[world.network]["contenders"]
-    env = MultiAgentVectorEnv(found.network, num_envs=len(found.values))
-    for name, controller in contenders(world, found.network).items():
-        run = rollout(env, controller(knobs[name]["knob"]), seed=first_seed(found.sampling.seed))
-        gaps = (
-            over_episodes(found.gaps(run.episode_circularity, run.episode_levels, with_foresight=informed)).as_dict()
-            for informed in (False, True)
-        )
-        levels = run.episode_levels.mean(axis=0)
-        figures = dict(zip(("gap", "foresight_gap"), gaps, strict=True))
-        figures |= {"circularity": run.episode_circularity.mean(), "level": levels.min()}
-        sys.stdout.write(f"{name}: {figures}\n")
-        sys.stdout.flush()
-        yield name, figures
+def measured(
+    name: str, make: Maker, found: UncertainBound, tune: int | None, episodes: int, margin: float = 1.0
+) -> dict[str, Any]:
+    """Return the figures of a contender on the first draws of a bound, its margin set on others if ``tune`` says so."""
+    network, figures = found.network, dict[str, Any]()
+    if tune is not None:
+        demand = np.full(len(network.services), DEMANDED)
+        calibration = calibrate(lambda copies: MultiAgentVectorEnv(network, num_envs=copies), make, demand, tune)
+        margin, figures = calibration.margin, {"tuned_on": tune, "excess": calibration.excess}
+    run = rollout(
+        MultiAgentVectorEnv(network, num_envs=episodes), make(margin=margin), seed=first_seed(found.sampling.seed)
+    )
+    for key, informed in (("gap", False), ("foresight_gap", True)):
+        gaps = found.gaps(run.episode_circularity, run.episode_levels, with_foresight=informed)
+        figures[key] = over_episodes(gaps).as_dict()
+    levels = dict(zip((s.id for s in network.services), run.episode_levels.T, strict=True))
+    figures |= {
+        "knob": margin,
+        "draws": episodes,
+        "circularity": over_episodes(run.episode_circularity).as_dict(),
+        "worst_circularity": worst_mean(run.episode_circularity).as_dict(),
+        "levels": {service: over_episodes(level, (0.0, 1.0)).as_dict() for service, level in levels.items()},
+        "worst_levels": {service: worst_mean(level).as_dict() for service, level in levels.items()},
+        "milliseconds": 1e3 * run.control_seconds / run.circularity.size,
+    }
+    sys.stdout.write(f"{network.name} {name}: {json.dumps(figures)}\n")
+    sys.stdout.flush()
+    return figures
 
 
 def table(results: Mapping[str, Any]) -> str:
     """Return what was measured as a table, and what it was made with."""
-    columns = ("world", "bound, + 95 %", "perfect information", "closed", "neutral", "plan", "rule", "draws")
+    columns = (
+        "world",
+        "who acts",
+        "gap to the bound",
+        "to perfect information",
+        "lowest service",
+        "λ̄",
+        "of the 5 % worst",
+        "ms",
+        "draws",
+    )
     return measured_table(columns, _rows(results))
 
 
 def _rows(results: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     for world, entry in entries(results):
-        gaps = {name: figures["gap"] for name, figures in entry["contenders"].items()}
-        best = min(figures["foresight_gap"]["value"] for figures in entry["contenders"].values())
-        closed = (entry["perfect_information"] - entry["bound"]) / abs(entry["bound"]) / best
-        yield (
-            f"`{world.network}`, {entry['unit']}",
-            f"{entry['bound']:.5g} + {100 * entry['half_width']:.2f} %",
-            f"{entry['perfect_information']:.5g}",
-            f"{100 * closed:z.1f} %",
-            *(_percent(gaps[name]) for name in ("neutral", "plan", "rule")),
-            f"{entry['draws']}",
-        )
+        value, informed = entry["bound"], entry["perfect_information"]
+        least = f"{_mass(value)} + {100 * entry['half_width']:.2f} %"
+        yield f"`{world.network}`, {entry['unit']}", "bound", "", "", "", least, "", "", f"{entry['draws']}"
+        yield "", "perfect information", "", "", "", _mass(informed), "", "", f"{entry['draws']}"
+        for name in [name for name in CONTENDERS if name in entry["contenders"]]:
+            figures = entry["contenders"][name]
+            service = min(figures["levels"], key=lambda id_: float(figures["levels"][id_]["value"]))
+            level = figures["levels"][service]["value"]
+            yield (
+                "",
+                name.replace("_", " "),
+                _percent(figures["gap"]),
+                _percent(figures["foresight_gap"]),
+                f"{level:.4f}{'' if abs(level - DEMANDED) <= CLOSE else ' (missed)'}",
+                _mass(figures["circularity"]["value"]),
+                _mass(figures["worst_circularity"]["value"]),
+                f"{figures['milliseconds']:.2g}" if figures["milliseconds"] >= NOTICEABLE else "",
+                f"{figures['draws']}",
+            )
+
+
+def _mass(value: float) -> str:
+    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
 def _percent(figure: Mapping[str, float]) -> str:
-    return f"{100 * figure['value']:.1f} ± {50 * (figure['high'] - figure['low']):.1f} %"
+    return f"{100 * figure['value']:.2f} ± {50 * (figure['high'] - figure['low']):.2f} %"
 
 
 def main() -> None:
@@ -94,15 +217,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("networks", nargs="*", metavar="NETWORK", help="default: all six")
     parser.add_argument("--table", action="store_true", help="measure nothing")
+    parser.add_argument("--only", default=",".join(CONTENDERS), help="contenders; default: all")
     parser.add_argument("--draws", type=int, default=200, help="of which the bound is the mean")
     parser.add_argument("--fit-draws", type=int, default=64, help="others, to which prices are fitted")
+    parser.add_argument("--tune", type=int, default=32, help="draws on which margins of those that plan are set")
+    parser.add_argument("--episodes", type=int, default=64, help="of those that plan for every decision")
     options = parser.parse_args()
     for world in WORLDS:
-        if not options.table and (not options.networks or world.network in options.networks):
-            sampling = Sampling(draws=options.draws, fit_draws=options.fit_draws, numbers=False)
-            figures = measured(world, sampling)
+        if options.table or (options.networks and world.network not in options.networks):
+            continue
+        found, seconds = proof(world, Sampling(draws=options.draws, fit_draws=options.fit_draws, numbers=False))
+        for name in options.only.split(","):
+            episodes = min(options.episodes, options.draws) if name in PLANNERS else options.draws
+            tune, margin = options.tune, 1.0
+            if name in SIMPLE:
+                tune, margin = None, json.loads(KNOBS.read_text())[world.network]["contenders"][name]["knob"]
+            figures = measured(name, CONTENDERS[name](world, found), found, tune, episodes, margin)
             results = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {}
-            write_json(RESULTS, {**results, world.network: figures})
+            rows = {**results.get(world.network, {}).get("contenders", {}), name: figures}
+            results[world.network] = {**bound_figures(found, seconds), "contenders": rows}
+            write_json(RESULTS, results)
     write_sections(DOCUMENT, {"foresight": table(json.loads(RESULTS.read_text()))})
 
 

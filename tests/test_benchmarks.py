@@ -7,15 +7,20 @@ import re
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import typer
 from some import some
+from test_uncertain_bound import works
 
 from benchmarks import foresight, paper, study, uncertain
-from cirl_marl import load_network
+from cirl_marl import MultiAgentVectorEnv, load_network
 from cirl_marl.controllers.lqr import LinearSystem
+from cirl_marl.controllers.rollout import first_seed, rollout
 from cirl_marl.jobs import run_jobs
+from cirl_marl.optimum import Sampling
+from cirl_marl.optimum.uncertain_bound import UncertainBound
 
 pytestmark = pytest.mark.medium
 
@@ -95,6 +100,30 @@ def test_tables_of_worlds_are_those_of_kept_results(benchmark: ModuleType) -> No
     table = benchmark.table(json.loads(benchmark.RESULTS.read_text()))
     rows = [line for line in table.splitlines() if line.startswith("|")]
     assert len(rows) > 2 and "\n".join(rows) in benchmark.DOCUMENT.read_text(encoding="utf-8")
+
+
+def test_bounds_of_worlds_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With all that gaps and the price policy need; of another question there is none."""
+    world, sampling = foresight.World("works", "", ()), Sampling(draws=10, fit_draws=4, numbers=False)
+    monkeypatch.setattr(foresight, "BOUNDS", tmp_path / "bounds")
+    monkeypatch.setattr(foresight, "load_network", lambda name: replace(works(2), scenario_name=""))
+    found, seconds = foresight.proof(world, sampling)
+    monkeypatch.setattr(foresight, "bound", None)
+    again, same_seconds = foresight.proof(world, sampling)
+    assert same_seconds == seconds > 0 and again.agents == found.agents
+    assert foresight.bound_figures(again, seconds) == foresight.bound_figures(found, seconds)
+    run = foresight.measured("price_policy", foresight.CONTENDERS["price_policy"](world, again), again, None, 10)
+    assert (
+        run["gap"]["value"] == found.gaps(*outcomes(found, foresight.CONTENDERS["price_policy"](world, found))).mean()
+    )
+    with pytest.raises(TypeError):
+        foresight.proof(world, replace(sampling, seed=1))
+
+
+def outcomes(found: UncertainBound, make: foresight.Maker) -> tuple[Any, Any]:
+    """Return λ̄ and levels of the episodes of a bound."""
+    run = rollout(MultiAgentVectorEnv(found.network, num_envs=len(found.values)), make(), seed=first_seed(0))
+    return run.episode_circularity, run.episode_levels
 
 
 def test_kept_results_name_no_machine() -> None:
