@@ -230,10 +230,10 @@ def test_blind_ones_begin_with_what_others_found(monkeypatch: pytest.MonkeyPatch
     assert updates == [blind.UPDATES // blind.FEWER]
     again, updates = made(first.with_margin(1.2), env)
     assert updates == [] and again is more
-    draws = MultiAgentVectorEnv(works(6), num_envs=8)
-    levels = []
+    count = blind.MORE_DRAWS * 8
+    draws, levels = MultiAgentVectorEnv(works(6), num_envs=count), []
     for schedule in (actions, more):
-        draws.reset(seed=list(range(blind.FIRST_DRAW, blind.FIRST_DRAW + 8)))
+        draws.reset(seed=list(range(blind.FIRST_DRAW, blind.FIRST_DRAW + count)))
         levels.append(gradient(draws, schedule).levels.mean())
     assert levels[0] >= 0.8 - blind.SHORTFALL and levels[1] >= 1 - 0.2 / 1.2 - blind.SHORTFALL
     assert blind.UPDATES in made(first, MultiAgentVectorEnv(works(5), num_envs=1))[1]

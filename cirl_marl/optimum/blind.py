@@ -41,6 +41,8 @@ LEVELS = (-1.0, -0.5, 0.0, 0.5, 1.0)
 """Actions with which the search for a constant begins."""
 DEGREE, ROUNDS = 1, 10
 """Of the programs of plans, and most steps by which the last of them is improved."""
+MORE_DRAWS = 4
+"""Times as many draws for a schedule, which has an action for every interval, and would fit itself to few."""
 UPDATES, FEWER = 200, 2
 """Of the ascent; what part of these, and of iterations, there are where another margin's actions are begun with."""
 SHORTFALL, RISE, RISES = 5e-4, 10.0, 2
@@ -92,7 +94,7 @@ class BestConstant(Planner):
             min_service: expected level demanded of every service, or of each, shape (services,), a share in [0, 1].
             service_weight: w of λ̄/circularity_scale + w·service; excludes ``min_service``.
             margin: by what the share of each service that may lack is divided.
-            draws: of which the mean counts; seeds of their own.
+            draws: of which the mean counts, with seeds of their own; MORE_DRAWS times as many for a schedule.
             population: actions tried in an iteration.
 
         Raises:
@@ -197,8 +199,9 @@ class BestSchedule(BestConstant):
 
     def _ascend(self, env: MultiAgentVectorEnv, start: Floats, updates: int) -> ScheduleAscent:
         """Return the best schedule met on the way up from one, over the common draws."""
-        draws = MultiAgentVectorEnv(env.network, num_envs=self._draws, agents=env.agents, uncertain=env.uncertain)
-        draws.reset(seed=list(range(FIRST_DRAW, FIRST_DRAW + self._draws)))
+        count = MORE_DRAWS * self._draws
+        draws = MultiAgentVectorEnv(env.network, num_envs=count, agents=env.agents, uncertain=env.uncertain)
+        draws.reset(seed=list(range(FIRST_DRAW, FIRST_DRAW + count)))
         demand, weight = self._demand(env.network), self._weight
         return improve_schedule(draws, start, min_service=demand, service_weight=weight, updates=updates)
 

@@ -17,7 +17,7 @@ RowParts = tuple[Any, Any, Any]
 """Rows over their interval, over the one before, and what scheduled arcs loosen them by, all sparse."""
 KEYS = 6
 """Whole numbers that say where a row comes."""
-MOST_ENTRIES = 4096
+MOST_ENTRIES = 2048
 """Of a cache, which is emptied then."""
 NOW, BEFORE, LOOSER = range(3)
 """What rows have entries of: their interval, the one before, and what scheduled arcs are asked for."""
