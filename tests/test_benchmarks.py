@@ -106,6 +106,7 @@ def test_bounds_of_worlds_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     """With all that gaps and the price policy need; of another question there is none."""
     world, sampling = uncertain.World("works", "", ()), Sampling(draws=10, fit_draws=4, numbers=False)
     monkeypatch.setattr(foresight, "BOUNDS", tmp_path / "bounds")
+    monkeypatch.setattr(foresight, "DEMANDED", 0.8)
     monkeypatch.setattr(foresight, "load_network", lambda name: replace(works(2), scenario_name=""))
     found, seconds = foresight.proof(world, sampling)
     monkeypatch.setattr(foresight, "bound", None)
