@@ -351,7 +351,7 @@ class WindowPlanner:
             solution = run(problem, basis, same_rows=same_rows, is_near=task.is_redrawn)
             lack, basis, same_rows = solution.plan[-services:], solution.basis, solution.basis is not None
             # what comes after was priced beside this price: another one would weigh the two differently
-            has_fixed_price = task.later is not None or (task.is_redrawn and not task.is_outlook)
+            has_fixed_price = task.later is not None or is_rough or (task.is_redrawn and not task.is_outlook)
             if lack.max() <= shortfall or has_fixed_price or rise == RISES:
                 break
             if least is None:
