@@ -12,12 +12,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from exact_episode import Controls, Interval, control_of, imbalance, intervals, mean_of, means, valve_of
+from exact_episode import (
+    SCHEDULED,
+    Controls,
+    Interval,
+    control_of,
+    imbalance,
+    intervals,
+    mean_of,
+    means,
+    share_of,
+    valve_of,
+)
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from small_networks import cycle, plain_networks
 
+from benchmarks.yearly import RATES, yearly_network
 from cirl_marl import (
     Arc,
     Control,
@@ -161,7 +173,7 @@ def variables(layout: Layout, happened: Sequence[Interval]) -> Floats:
     entering[np.arange(len(network.arcs)), network.recipients] = 1.0
     entering = entering[:, len(network.stores) :]
     found: list[Floats] = []
-    for each in happened:
+    for step, each in enumerate(happened):
         valve = np.array([valve_of(network, name, each.controls) for name in names])
         together = len(each.pieces) // layout.pieces
         for first in range(0, len(each.pieces), together):
@@ -172,8 +184,27 @@ def variables(layout: Layout, happened: Sequence[Interval]) -> Floats:
             found.append(merged[-1].end)
             if layout.has_end_flows:
                 found += [merged[-1].end_flow @ entering, merged[-1].end_flow]
+        first_flow = means(each.pieces[:together], layout.degree)[1][0]
+        refilled = np.isin(network.donors, network.recipients) & (len(each.pieces) > 1)
+        found += constant_parts(layout, each.controls, step, np.where(refilled, 0.0, first_flow))
         found += [each.levels, np.array([imbalance(network, each.flow)]), valve[layout.free_valves]]
     return np.concatenate(found)
+
+
+def constant_parts(layout: Layout, controls: Controls, step: int, flow: Floats) -> list[Floats]:
+    """Return what of throughputs, and of what nodes without stock hand on, comes from given scheduled flows."""
+    network, scheduled = layout.network, np.array([arc.law in SCHEDULED for arc in layout.network.arcs], dtype=bool)
+    stores, nodes = len(network.stores), len(network.nodes)
+    shares = np.zeros(len(network.arcs))
+    through = np.flatnonzero(network.donors >= stores)
+    shares[through] = [share_of(network, network.arcs[k], controls, step) for k in through]
+    handed_on = np.zeros((nodes, nodes))
+    np.add.at(handed_on, (network.recipients[through], network.donors[through]), shares[through])
+    entering = np.bincount(network.recipients[scheduled], flow[scheduled], nodes)
+    entering[:stores] = 0.0
+    constant = np.linalg.solve(np.eye(nodes) - handed_on, entering)
+    arcs = layout.steady_arcs
+    return [constant[layout.steady_nodes], shares[arcs] * constant[network.donors[arcs]]]
 
 
 def assert_satisfies(problem: Program, v: Floats, mass: float) -> None:
@@ -499,3 +530,59 @@ def test_merged_pieces_are_as_tight() -> None:
     proved = [-float(problem.cost @ solve(problem).plan) for problem in (fine, merged)]
     assert len(merged.cost) < 0.1 * len(fine.cost)
     assert proved[1] == pytest.approx(proved[0], rel=0.05)
+
+
+@pytest.mark.medium
+@pytest.mark.sample(2)
+@pytest.mark.parametrize("merged", [False, True])
+@pytest.mark.parametrize("seed", [2, 13, 20, 22])
+def test_shares_of_nodes_without_stock(seed: int, merged: bool) -> None:
+    """Markets that share out what comes from mines, hoards that run dry, fast furnaces and products in use."""
+    network = yearly_network(seed, replace(RATES, years=(3, 3), regions=(1, 2), products=(2, 3)))
+    scarce = {"hoard": 0.02, "mine": 0.01}
+    nodes = []
+    for node in network.nodes:
+        amount = (node.initial or (node.scale, 0.0))[0] * scarce.get(node.id.rpartition("_")[2], 1.0)
+        nodes.append(replace(node, initial=(amount, amount)) if node.stores else node)
+    network, rng = replace(network, nodes=tuple(nodes)), np.random.default_rng(seed)
+    for style, degree in (("inside", 3), ("ends", 2)):
+        played = play(network, rng, style)
+        assert_holds(played, degree, None, merged)
+    layout = Programs(Admissible.of(network), 1, None).layout
+    assert len(layout.steady_nodes) and len(layout.steady_arcs)
+
+
+def test_shares_are_the_same_all_year() -> None:
+    """A market cannot give one product what comes early and another what comes late.
+
+    Each has a life of a year; the level of one is what it gets, of the other what it has at the end. With a share s of
+    an inflow of 1 the levels are s and (1 − s)(1 − 1/e)/(1 − 1/e), which add up to 1.
+    """
+    share = Control(kind=ControlKind.SHARE, low=0.0, neutral=0.5, high=1.0)
+    network = Network(
+        name="market",
+        nodes=(
+            Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR, initial=(100.0, 100.0)),
+            Node(id="early"),
+            Node(id="late"),
+            Node(id="tip", role=Role.LANDFILL),
+            Node(id="sale", stores=False),
+        ),
+        arcs=(
+            Arc(id="mining", donor="mine", recipient="sale", law=Law.EXOGENOUS, flow=1.0),
+            Arc(id="to_early", donor="sale", recipient="early", law=Law.SHARE, control=share),
+            Arc(id="to_late", donor="sale", recipient="late", law=Law.SHARE),
+            Arc(id="early_end", donor="early", recipient="tip", rate=1.0),
+            Arc(id="late_end", donor="late", recipient="tip", rate=1.0),
+        ),
+        services=(
+            Service(id="sold", provider="to_early", quantity="flow", low=1.0),
+            Service(id="held", provider="late", quantity="stock", low=-math.expm1(-1.0)),
+        ),
+        episode=Episode(control_interval=1.0, horizon=1),
+        objective=Objective(circularity_scale=1.0),
+    )
+    problem = Programs(Admissible.of(network), 2, None).program(network.initial[1])
+    cost = np.zeros_like(problem.cost)
+    cost[problem.layout.level : problem.layout.imbalance] = -1.0
+    assert -float(cost @ solve(replace(problem, cost=cost)).plan) == pytest.approx(1.0, abs=1e-6)

@@ -142,21 +142,34 @@ def delivery_limits(ranges: IntervalRanges, rows: ProgramRows) -> None:
     rows.at_start(row, piece, nodes, -share[nodes] / layout.length)
 
 
-def constant_schedules(ranges: IntervalRanges, equal: ProgramRows, under: ProgramRows) -> None:
+def constant_schedules(ranges: IntervalRanges, equal: ProgramRows, under: ProgramRows, across: bool) -> None:
     """Add that a scheduled flow is constant in its piece, F_i = F_0; keys (0, moment, 0, arc, side).
 
-    If pieces are coarse, a flow that nothing can cut is constant in the interval.
+    If pieces are coarse, or where it is asked for ``across`` pieces, a flow that nothing can cut is constant in the
+    interval.
     """
     layout, arcs = equal.layout, np.flatnonzero(ranges.by_schedule)
     moment = layout.moment_column
+    if across and not layout.coarse:
+        later = moment[layout.degree + 1 :: layout.degree + 1]
+        _hold_schedules(under, arcs, later, 0 * later)
     first = 0 * moment if layout.coarse else moment - moment % (layout.degree + 1)
     later = (moment > first).ravel()
-    for rows, side, sign in ((under, 0, 1.0), (under, 1, -1.0)) if layout.coarse else ((equal, 0, 1.0),):
-        row = rows.add(0, moment[later], 0, arcs, side)
-        rows.put(row, layout.flow[moment[later]] + arcs, sign)
-        rows.put(row, layout.flow[first[later]] + arcs, -sign)
-        if layout.coarse:
-            rows.loosen(row, arcs, 1.0)
+    if layout.coarse:
+        _hold_schedules(under, arcs, moment[later], first[later])
+        return
+    row = equal.add(0, moment[later], 0, arcs, 0)
+    equal.put(row, layout.flow[moment[later]] + arcs, 1.0)
+    equal.put(row, layout.flow[first[later]] + arcs, -1.0)
+
+
+def _hold_schedules(rows: ProgramRows, arcs: Integers, moment: Integers, first: Integers) -> None:
+    """Add that scheduled flows in some moments are those of others, but for what is cut."""
+    for side, sign in ((0, 1.0), (1, -1.0)):
+        row = rows.add(0, moment, 0, arcs, side)
+        rows.put(row, rows.layout.flow[moment] + arcs, sign)
+        rows.put(row, rows.layout.flow[first] + arcs, -sign)
+        rows.loosen(row, arcs, 1.0)
 
 
 def service_levels(ranges: IntervalRanges, rows: ProgramRows) -> None:

@@ -139,7 +139,7 @@ class DrawProgram:
         """
         admissible = Admissible.of(draw.network, agents)
         self.draw, self._totals = draw, admissible.lifetimes.totals
-        self._programs = Programs(admissible, degree, service_weight)
+        self._programs = Programs(admissible, degree, service_weight, constant_shares=False)
         self.problem = self._programs.program(draw.initial)
         self.layout = self.problem.layout
 

@@ -27,15 +27,18 @@ from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.solver import Infeasible, SolverFailure, best_values, solve
 
 TRUST, SMALLEST = 0.25, 1e-5
-"""First and smallest half-width of the trust region, in normalised actions."""
+"""First and smallest half-width of the trust region, in normalised actions: an eighth of their range, and what moves λ̄
+by less than the tolerance of HiGHS."""
 PENALTY = 3.0
-"""What is charged for what a service lacks, times the price that the bound puts on it."""
+"""What is charged for what a service lacks, times the price that the bound puts on it. Any factor above 1 is exact at
+that price; constant controls pay more for service than the bound says."""
 REFINEMENT_ROUNDS = 2
-"""Most programs that are solved."""
+"""Most programs that are solved. Each takes about as long as the bound: the first makes up for factors that vary in the
+bound's plan, the second for what is left to first order."""
 REFINEMENT_DEGREE = 1
 """Degree of these programs, whatever that of the bound: they are solved several times."""
 TOLERATED_SHORTFALL = 1e-4
-"""What a service may lack of its demand without a further round."""
+"""What a service may lack of its demand without a further round: a hundredth of a gap of 1 %."""
 
 
 def improve_plan(

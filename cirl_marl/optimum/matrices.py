@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
+from copy import copy
 from itertools import product
 from typing import Any, TypeVar
 
@@ -19,6 +20,7 @@ KEYS = 6
 """Whole numbers that say where a row comes."""
 MOST_ENTRIES = 2048
 """Of a cache, which is emptied then."""
+NOTHING: Integers = np.zeros(0, dtype=np.intp)
 NOW, BEFORE, LOOSER = range(3)
 """What rows have entries of: their interval, the one before, and what scheduled arcs are asked for."""
 
@@ -70,6 +72,9 @@ class Layout:
         end: first of the stocks at the end of each piece, shape (pieces,).
         end_flow: first of the flows at the end of each piece, which stand behind the throughputs, likewise.
         last: the stocks at the end of the interval.
+        steady_nodes: nodes without stock of whose throughput the constant part A is a variable.
+        steady_arcs: their outflows, of whose flow the constant part a is one too.
+        steady: first of A, which a follows.
         level: first of the service levels.
         imbalance: the variable that is at least |Δ·σ_env·f̄|; counted only with ``net_zero = "abs"``.
         free_valve: first of the valves v themselves.
@@ -106,10 +111,21 @@ class Layout:
         self.end = np.arange(pieces) * piece_size + (degree + 1) * block
         self.end_flow = self.end + nodes
         self.last = slice(int(self.end[-1]), int(self.end[-1]) + len(network.stores))
-        self.level = pieces * piece_size
-        self.imbalance = self.level + len(network.services)
+        self.steady = pieces * piece_size
+        self._lay_out_interval(NOTHING, NOTHING)
+
+    def _lay_out_interval(self, steady_nodes: Integers, steady_arcs: Integers) -> None:
+        self.steady_nodes, self.steady_arcs = steady_nodes, steady_arcs
+        self.level = self.steady + len(steady_nodes) + len(steady_arcs)
+        self.imbalance = self.level + len(self.network.services)
         self.free_valve = self.imbalance + 1
-        self.size = self.free_valve + len(free_valves)
+        self.size = self.free_valve + len(self.free_valves)
+
+    def with_constant_parts(self, nodes: Integers, arcs: Integers) -> Layout:
+        """Return the layout in which constant parts of some throughputs and flows are variables too."""
+        layout = copy(self)
+        layout._lay_out_interval(nodes, arcs)
+        return layout
 
     @property
     def key(self) -> Hashable:

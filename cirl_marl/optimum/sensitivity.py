@@ -63,6 +63,7 @@ def _start_dependent(admissible: Admissible, layout: Layout) -> NDArray[np.bool_
         if layout.has_end_flows:
             follows[layout.end[piece] :][:nodes] = True
             follows[layout.end_flow[piece] :][:arcs] = by_stock
+    follows[layout.steady : layout.level] = True
     follows[layout.imbalance] = True
     return follows
 

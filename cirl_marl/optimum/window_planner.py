@@ -153,7 +153,7 @@ class Future:
         self.cache: IntervalCache = IntervalCache() if like is None else like.cache
         self._shift = 0
         if like is None:
-            self._programs = Programs(admissible, degree, service_weight)
+            self._programs = Programs(admissible, degree, service_weight, constant_shares=False)
         else:
             admissible.lifetimes.cache = like.admissible.lifetimes.cache
             self._programs = Programs(admissible, degree, service_weight, layout=like.layout, cache=self.cache)
