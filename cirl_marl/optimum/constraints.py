@@ -151,8 +151,8 @@ def constant_schedules(ranges: IntervalRanges, equal: ProgramRows, under: Progra
     layout, arcs = equal.layout, np.flatnonzero(ranges.by_schedule)
     moment = layout.moment_column
     if across and not layout.coarse:
-        later = moment[layout.degree + 1 :: layout.degree + 1]
-        _hold_schedules(under, arcs, later, 0 * later)
+        starts = moment[layout.degree + 1 :: layout.degree + 1]
+        _hold_schedules(under, arcs, starts, 0 * starts)
     first = 0 * moment if layout.coarse else moment - moment % (layout.degree + 1)
     later = (moment > first).ravel()
     if layout.coarse:
