@@ -275,7 +275,7 @@ class ConstantShares:
         visits: Floats = self.linear.routes.visits[entries - self.stores, donor - self.stores] * WIDER
         return visits
 
-    def _carried(self, donor: int, sources: Sources) -> float:
+    def _most_outflow(self, donor: int, sources: Sources) -> float:
         """Return what fast stocks make pass a node at the most, of a unit of flow into them in an interval."""
         flow = self.linear.pass_flow[[donor - self.stores]][:, sources.fast]
         return float(flow.toarray().max(initial=0.0)) * self.interval * WIDER
@@ -289,7 +289,7 @@ class ConstantShares:
             sources.dry,
         )
         self.rows.loosen(row[:, None], direct, spread * self._visits(donor, self.network.recipients[direct]))
-        self.rows.loosen(row[:, None], behind, spread * self._carried(donor, sources))
+        self.rows.loosen(row[:, None], behind, spread * self._most_outflow(donor, sources))
 
     def _allow_varying(
         self, row: Integers, donor: int, spread: Floats, sources: Sources, moment: int, ratio: float
@@ -301,6 +301,6 @@ class ConstantShares:
         kept = np.where(is_substep & self.ranges.by_schedule[transit.varying_flow[direct]], 1.0 - ratio, 1.0)
         weight = kept * transit.varying_part[direct] * self._visits(donor, transit.varying_entry[direct])
         rows.put(row[:, None], layout.flow[moment] + transit.varying_flow[direct], -spread[:, None] * weight)
-        share = transit.varying_part[behind] * self._carried(donor, sources) / len(layout.moments)
+        share = transit.varying_part[behind] * self._most_outflow(donor, sources) / len(layout.moments)
         for column in layout.flow.tolist() if len(behind) else ():
             rows.put(row[:, None], column + transit.varying_flow[behind], -spread[:, None] * share)
