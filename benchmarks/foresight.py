@@ -14,7 +14,7 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -26,8 +26,9 @@ from benchmarks.document import measured_table, write_sections
 from benchmarks.uncertain import CLOSE, DEMANDED, WORLDS, World, entries
 from benchmarks.uncertain import RESULTS as KNOBS
 from benchmarks.uncertain import contenders as simple_contenders
-from cirl_marl import MultiAgentVectorEnv, Network, bound, load_network
+from cirl_marl import MultiAgentVectorEnv, Network, Trained, bound, load_network, train
 from cirl_marl.controllers import Controller
+from cirl_marl.controllers.basic import Arrays
 from cirl_marl.controllers.rollout import first_seed, rollout
 from cirl_marl.definitions.writer import fingerprint
 from cirl_marl.evaluation.calibration import calibrate
@@ -42,12 +43,15 @@ from cirl_marl.records.files import write_atomically, write_json
 DOCUMENT = Path(__file__).parent.parent / "docs" / "uncertainty.md"
 RESULTS = Path(__file__).parent / "results" / "foresight.json"
 BOUNDS = Path(__file__).parent / "results" / "bounds"
+RUNS = Path("runs") / "foresight"
 WINDOW, FUTURES = 3, 4
 """Decisions that MPC looks ahead, and futures that scenario MPC plans for."""
 SIMPLE = ("neutral", "plan", "rule")
 """Contenders of ``benchmarks.uncertain``, whose knobs are set there."""
 PLANNERS = ("mpc", "scenario_mpc", "price_policy")
 """Contenders that solve a program for every decision, of which fewer episodes are measured."""
+LEARNERS = ("exact_gradients",)
+"""Recipes of independent learners, who see what is local; prices in their training see to their service."""
 BY_DRAW, PRICES = (
     ("values", "informed_values", "luck", "informed_luck", "gross_mass"),
     ("prices", "informed_prices"),
@@ -73,6 +77,42 @@ CONTENDERS: Mapping[str, Callable[[World, UncertainBound], Maker]] = {
     "price_policy": lambda world, found: partial(MPC, min_service=DEMANDED, prices=found.prices),
 }
 """Who acts, by name: what makes a controller with a ``margin`` in a world, given its bound."""
+
+
+class Alternating(Controller):
+    """Teams that take turns: of n teams team k acts in the copies k, k + n, and so on."""
+
+    def __init__(self, teams: Sequence[Controller]) -> None:
+        """Take the teams."""
+        self._teams = teams
+
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
+        """Start every team."""
+        for team in self._teams:
+            team.start(env, seed)
+
+    def act(self, observations: Arrays) -> Arrays:
+        """Return in each copy what its team does."""
+        actions = {agent: rows.copy() for agent, rows in self._teams[0].act(observations).items()}
+        for k, team in enumerate(self._teams[1:], 1):
+            for agent, rows in team.act(observations).items():
+                actions[agent][k :: len(self._teams)] = rows[k :: len(self._teams)]
+        return actions
+
+
+def learners(recipe: str, world: World, seeds: Sequence[int], steps: int | None) -> Alternating:
+    """Return what a recipe learns from several seeds; runs are kept in runs/foresight, and used again."""
+    teams = list[Controller]()
+    for seed in seeds:
+        directory = RUNS / f"{world.network}-{recipe}-{seed}"
+        if not directory.is_dir():
+            train(world.network, recipe, scenario=world.scenario, seed=seed, steps=steps, directory=directory)
+        teams.append(Trained(directory))
+    return Alternating(teams)
+
+
+def _whatever_margin(controller: Controller) -> Maker:
+    return lambda margin: controller
 
 
 def proof(world: World, sampling: Sampling) -> tuple[UncertainBound, float]:
@@ -187,13 +227,13 @@ def _rows(results: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
         least = f"{_mass(value)} + {100 * entry['half_width']:.2f} %"
         yield f"`{world.network}`, {entry['unit']}", "bound", "", "", "", least, "", "", f"{entry['draws']}"
         yield "", "perfect information", "", "", "", _mass(informed), "", "", f"{entry['draws']}"
-        for name in [name for name in CONTENDERS if name in entry["contenders"]]:
+        for name in [name for name in (*CONTENDERS, *LEARNERS) if name in entry["contenders"]]:
             figures = entry["contenders"][name]
             service = min(figures["levels"], key=lambda id_: float(figures["levels"][id_]["value"]))
             level = figures["levels"][service]["value"]
             yield (
                 "",
-                name.replace("_", " "),
+                name.replace("_", " ") + (f", seeds: {figures['seeds']}" if name in LEARNERS else ""),
                 _percent(figures["gap"]),
                 _percent(figures["foresight_gap"]),
                 f"{level:.4f}{'' if abs(level - DEMANDED) <= CLOSE else ' (missed)'}",
@@ -217,10 +257,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("networks", nargs="*", metavar="NETWORK", help="default: all six")
     parser.add_argument("--table", action="store_true", help="measure nothing")
-    parser.add_argument("--only", default=",".join(CONTENDERS), help="contenders; default: all")
+    parser.add_argument("--only", default=",".join((*CONTENDERS, *LEARNERS)), help="contenders; default: all")
     parser.add_argument("--draws", type=int, default=200, help="of which the bound is the mean")
     parser.add_argument("--fit-draws", type=int, default=64, help="others, to which prices are fitted")
     parser.add_argument("--tune", type=int, default=32, help="draws on which margins of those that plan are set")
+    parser.add_argument("--seeds", type=int, default=1, help="trainings of learners, which take turns in the draws")
+    parser.add_argument("--steps", type=int, help="of a training; default: the recipe's")
     parser.add_argument("--episodes", type=int, default=64, help="of those that plan for every decision")
     options = parser.parse_args()
     for world in WORLDS:
@@ -232,7 +274,13 @@ def main() -> None:
             tune, margin = options.tune, 1.0
             if name in SIMPLE:
                 tune, margin = None, json.loads(KNOBS.read_text())[world.network]["contenders"][name]["knob"]
-            figures = measured(name, CONTENDERS[name](world, found), found, tune, episodes, margin)
+            if name in LEARNERS:
+                tune, make = None, _whatever_margin(learners(name, world, range(1, options.seeds + 1), options.steps))
+            else:
+                make = CONTENDERS[name](world, found)
+            figures = measured(name, make, found, tune, episodes, margin)
+            if name in LEARNERS:
+                figures |= {"seeds": options.seeds, "steps": options.steps}
             results = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {}
             rows = {**results.get(world.network, {}).get("contenders", {}), name: figures}
             results[world.network] = {**bound_figures(found, seconds), "contenders": rows}
