@@ -200,6 +200,7 @@ class Supply:
                     break
                 is_telling = is_wrong & (np.abs(expected) > NOTICEABLE * demand)
                 factor *= np.divide(base - earlier, expected, out=np.ones_like(base), where=is_telling)
+                factor[factor <= 0] = 1.0  # what others supplied outweighed it
                 # where all have come to their bounds, the last that did can go back
                 has_room = (weights > 0) & ((extent < reach) | (reach >= furthest[self.of]))
                 bends = np.ones((count, batch), dtype=bool)
