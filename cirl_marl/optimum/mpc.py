@@ -292,7 +292,7 @@ class MPC(Planner):
         price = planner.first_price if last is None else last.task.price
         if len(self._price) and not is_outlook:
             price = self._price
-        is_redrawn = bool(self._env.network.disturbed)
+        is_redrawn = any(low < high for low, high in (part.ends for part in self._env.network.processes.disturbances))
         task = WindowTask(stock, intervals, demand, later, price, corrections, is_outlook, is_redrawn)
         return planner.plan(task, last.basis(intervals) if last else None, self._replan)
 
