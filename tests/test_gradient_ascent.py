@@ -92,12 +92,13 @@ def test_each_service_has_a_price(monkeypatch: pytest.MonkeyPatch) -> None:
     def watch(stack: GradientStack, levels: np.ndarray) -> None:
         move(stack, levels)
         lower = levels.mean(axis=1) - 2 * 1.645 * levels.std(axis=1) / 3  # of nine episodes
-        errors.append(np.clip((0.9 - lower) / 0.1, -1, 1))
+        errors.append(np.clip((0.98 - lower) / 0.02, -1, 1))
         model[:] = [stack._models[0], stack._prices]
 
     monkeypatch.setattr(GradientStack, "_move_prices", watch)
-    asked = {"steps": 40, "evaluations": 1, "episodes": 9, "min_service": 0.9, "price_rate": 0.3, "price_damping": 0.7}
-    train("carbo_net", recipe(asked), circularity_weight=0.8)
+    asked = {"steps": 40, "evaluations": 1, "episodes": 9, "min_service": 0.98, "price_rate": 0.3, "price_damping": 0.7}
+    training = train("carbo_net", recipe(asked), circularity_weight=0.8)
+    assert training.env.circularity_weight == 0.8  # evaluations move no price
     assert len(errors) == 5 and np.abs(errors).max() > 0
     stated = np.array([0.25 * service.weight for service in load_network("carbo_net").services])
     prices = stated * np.exp(0.3 * np.sum(errors, axis=0) + 0.7 * errors[-1])

@@ -174,6 +174,18 @@ def test_no_episode_of_a_generated_cycle_exceeds_its_bound(seed: int) -> None:
             assert run.episode_circularity[0] <= found.objective + 1e-9 * abs(found.objective)
 
 
+@pytest.mark.medium
+@pytest.mark.parametrize("seed", [106, 109])
+def test_no_improved_plan_of_a_cycle_exceeds_its_bound(seed: int) -> None:
+    """Markets share out what leaves lifetimes, whose stages may be fast: its flow may fall as fast as it likes."""
+    few = replace(LIFETIMES, years=(6, 8), regions=(1, 2), products=(1, 3), lifetimes=(1, 4), prolonged=0.3)
+    network = yearly_network(seed, replace(few, supplied=0.3, idle=0.5))
+    found = bound(network, degree=2, min_service=0.9)
+    run = simulate_plan(improve_plan(found))
+    most = float(found.at(found.initial, np.minimum(run.episode_levels[0], 1.0) * (1 - 1e-9)))
+    assert run.episode_circularity[0] <= most + 1e-7 * abs(most)
+
+
 def test_a_delay_is_exact() -> None:
     """What comes out of a fixed lifetime is known, or entered before: nothing is left open."""
     network = town(LIVES[1], INFLOW[:20], initial=60.0, growth=0.03)

@@ -76,7 +76,9 @@ def test_what_follows_on_a_state_is_drawn_from_it() -> None:
     network = line(EVERYWHERE)
     processes: DisturbanceProcesses = network.processes
     states, count = processes.sample(range(3)).states[2, :, [1]].T, 20_000
-    paths = processes.continuations(np.repeat(states, count, axis=1), 2, future_noise(2, 3, len(states), count))
+    noise = future_noise(2, 3, len(states), count)
+    np.testing.assert_array_equal(noise[..., 1::2], -noise[..., ::2])  # antithetic
+    paths = processes.continuations(np.repeat(states, count, axis=1), 2, noise)
     np.testing.assert_array_equal(paths.values[0], np.repeat(processes.values(states, 2), count, axis=1))
     means, deviation = processes.conditional_means(states, 2, 3)[..., 0], paths.values[1:].std(axis=2)
     assert (np.abs(paths.values[1:].mean(axis=2) - means) < 4 * deviation / np.sqrt(count / 2) + 1e-12).all()
