@@ -36,6 +36,9 @@ class Scoring:
     [low, high] is min(1, q/low, high/q), without q/low if low = 0.
 
     Args of all methods are compartment-major, shape (rows, B).
+
+    Attributes:
+        service_factors: by which weights are multiplied in rewards, shape (services,).
     """
 
     def __init__(self, dynamics: Dynamics, layout: ObservationLayout, agents: Sequence[str], batch: int) -> None:
@@ -50,6 +53,7 @@ class Scoring:
         self._set_point = np.repeat(set_point[:, None], batch, axis=1)  # equal shapes are faster than a broadcast
         self._inverse_scale = np.repeat(inverse_scale[:, None], batch, axis=1)
         services = network.services
+        self.service_factors: Floats = np.ones(len(services))
         self._measure = _measurement(network, layout)
         self._vary_in_time = any(isinstance(band, Series) for s in services for band in (s.low, s.high))
         width = network.episode.horizon if self._vary_in_time else 1
@@ -142,7 +146,7 @@ class Scoring:
         np.subtract(quantities[:count], self._set_point, out=distance)
         distance *= self._inverse_scale
         distance *= distance
-        np.subtract(1.0, levels, out=terms[count : count + services])
+        np.multiply(1.0 - levels, self.service_factors[:, None], out=terms[count : count + services])
         terms[count + services :] = inner
         return terms
 
@@ -160,8 +164,8 @@ class Scoring:
         return total
 
     def shortfall(self, levels: Floats) -> Floats:
-        """Return Σ_s weight_s · (1 − level_s), shape (B,)."""
-        total: Floats = self._weighted_shortfall(1.0 - levels)[0]
+        """Return Σ_s factor_s · weight_s · (1 − level_s), shape (B,)."""
+        total: Floats = self._weighted_shortfall((1.0 - levels) * self.service_factors[:, None])[0]
         return total
 
     def service_level(self, levels: Floats) -> Floats:

@@ -53,6 +53,11 @@ class Starts:
         self._low = np.concatenate([network.initial[0], inner.low])
         self._width = np.concatenate([network.initial[1], inner.high]) - self._low
 
+    @property
+    def are_random(self) -> bool:
+        """Whether two copies can begin differently, or be disturbed by other values."""
+        return bool(self._width.any() or len(self._of_models) or self.processes.names)
+
     def begin(self, seed: int | Sequence[int] | None, options: Mapping[str, Any] | None) -> Floats:
         """Return the state in which every copy starts, shape (rows, B); see ``MultiAgentVectorEnv.reset``."""
         seeds = None if seed is None else self._seeds(seed)

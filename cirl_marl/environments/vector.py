@@ -166,6 +166,23 @@ class MultiAgentVectorEnv:
         self._credit.weigh(_share(weight))
 
     @property
+    def service_factors(self) -> Floats:
+        """Factors on the weights of services in rewards, shape (services,); others count from the next step on."""
+        return self.scoring.service_factors
+
+    @service_factors.setter
+    def service_factors(self, factors: ArrayLike) -> None:
+        values = np.array(factors, dtype=np.float64)
+        if values.shape != self.scoring.service_factors.shape or not (np.isfinite(values) & (values >= 0)).all():
+            raise CirlError(f"service_factors must be {len(self._services)} numbers of at least 0, got {factors!r}")
+        self.scoring.service_factors = values
+
+    @property
+    def is_random(self) -> bool:
+        """Whether episodes differ by anything but what agents do: starts, models, uncertain numbers, disturbances."""
+        return self.uncertain or self._starts.are_random
+
+    @property
     def neutral_action(self) -> dict[str, Floats]:
         """Action of each agent that leaves it neutral in the coming interval, shape (num_envs, entries) each.
 

@@ -24,12 +24,11 @@ from cirl_marl.learners.checkpoint import read_tree, write_tree
 from cirl_marl.learners.demonstrations import Demonstrator
 from cirl_marl.learners.learner import Learner, derived_seed, has_tensorboard
 from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, Streams, TrainingStop
-from cirl_marl.learners.policies import Policies
 from cirl_marl.learners.run_directory import RunConfig, RunDirectory, TableFile, steps_of
 from cirl_marl.learners.stacked.conditions import gradient_obstacle, gradient_stacks, obstacle, stacks
-from cirl_marl.learners.stacked.stack import Stack
+from cirl_marl.learners.stacked.stack import Stack, StackedPolicies
 from cirl_marl.learners.start import begin_again, begin_from
-from cirl_marl.learners.validation import MULTIPLIER_FROM, Score, ServiceMultiplier, validation_score
+from cirl_marl.learners.validation import Score, ServiceMultiplier, validation_score
 from cirl_marl.network.declarations import positional_record
 
 CHECKPOINTS = 10
@@ -83,7 +82,7 @@ class Training:
         self._metrics: TableFile | None = None
         self._evaluations: TableFile | None = None
         self._best: Score | None = None
-        self._bring_up_to_date: Callable[[], None] = lambda: None
+        self._stacks: Sequence[Stack] = ()
         self._saved_state = None
         self.done = 0 if checkpoint is None else steps_of(checkpoint)
         if checkpoint is not None and (checkpoint / "training.json").is_file():
@@ -111,14 +110,16 @@ class Training:
         elif checkpoint.name.endswith("-start"):
             for learner, _ in starts:
                 begin_again(checkpoint, learner)
+        self._multiplier = self._service_multiplier()  # its least price is the recipe's, not one that has moved
         if self._saved_state is not None:
             self.world.load_state_dict(self._saved_state["world"])
-        self._multiplier = self._service_multiplier(checkpoint)
+        if self._multiplier is not None and checkpoint is not None:
+            self._multiplier.load(checkpoint)
         run_settings = config.recipe.run
         self._validation_env: MultiAgentVectorEnv | None = None
         if run_settings.evaluations:
             self._validation_env = MultiAgentVectorEnv(
-                env.network, num_envs=run_settings.episodes, agents=env.agents, **config.options
+                env.network, num_envs=run_settings.episodes if env.is_random else 1, agents=env.agents, **config.options
             )
         self._last_evaluation = -1
         self._checkpoint_folder: Path | None = None
@@ -128,8 +129,8 @@ class Training:
         self._checkpoint_interval = self._shortest_interval or None
         self._appoint_demonstrators()
 
-    def _service_multiplier(self, checkpoint: Path | None) -> ServiceMultiplier | None:
-        """Return the multiplier of the service if it moves, at the value that a checkpoint has."""
+    def _service_multiplier(self) -> ServiceMultiplier | None:
+        """Return the multipliers of the services if they move."""
         settings = self.config.recipe.run
         by_evaluations = bool(settings.price_rate) and settings.engine != "gradients"
         if not by_evaluations or settings.min_service is None or not self.env.network.services:
@@ -139,10 +140,7 @@ class Training:
                 f"recipe '{self.config.recipe.name}': run.price_rate: reward '{self.env.reward_mode}' has no price of "
                 f"service that could move; choose {', '.join(CIRCULARITY_REWARDS)}, or a price_rate of 0"
             )
-        multiplier = ServiceMultiplier(self.env, settings.min_service, settings.price_rate, settings.price_damping)
-        if checkpoint is not None:
-            multiplier.load(checkpoint)
-        return multiplier
+        return ServiceMultiplier(self.env, settings.min_service, settings.price_rate, settings.price_damping)
 
     def keep_in(self, run: RunDirectory) -> None:
         """Keep metrics, logs, checkpoints and the best of them in ``run`` from now on."""
@@ -305,8 +303,8 @@ class Training:
         if self._validation_env is None:
             return
         self._bring_up_to_date()
-        policies = Policies({name: learner.policy for name, learner in self.learners.items()})
-        score, target = validation_score(self._validation_env, policies), self.config.recipe.run.min_service
+        score = validation_score(self._validation_env, StackedPolicies(self.learners, self._stacks))
+        target = self.config.recipe.run.min_service
         self._last_evaluation = self.joint_steps
         better = self._best is None or score.rank(target) > self._best.rank(target)
         if better:
@@ -315,9 +313,10 @@ class Training:
                 self.run.save_best(self.joint_steps, self._write_policies, score.figures())
         if self._evaluations is not None:
             steps = (self.joint_steps, self.joint_steps * self.config.envs)
-            self._evaluations.append([*steps, *score.figures().values(), self.env.circularity_weight, better])
-        if self._multiplier is not None and self.joint_steps * self.config.envs >= MULTIPLIER_FROM * self.config.steps:
-            self._multiplier.update(score.service_bound)
+            row = (score.circularity, score.service, score.service_bound, score.episode_return)
+            self._evaluations.append([*steps, *row, self.env.circularity_weight, better])
+        if self._multiplier is not None:
+            self._multiplier.update([*score.levels.values()])
 
     def _write_policies(self, folder: Path) -> None:
         for learner in self.learners.values():
@@ -325,13 +324,17 @@ class Training:
         if self._multiplier is not None:
             self._multiplier.save(folder)
 
-    def runs_stacked(self, bring_up_to_date: Callable[[], None], names: Container[str]) -> None:
-        """Have models of the ``names`` learners brought up to date before they are saved or act.
+    def _bring_up_to_date(self) -> None:
+        for stack in self._stacks:
+            stack.give()
+
+    def runs_stacked(self, stacks_of_learners: Sequence[Stack], names: Container[str]) -> None:
+        """Have the ``names`` learners act by their stacks, which bring their models up to date before they are saved.
 
         Raises:
             RunError: if a learner goes on that ran by itself, and now would not, or the other way round.
         """
-        self._bring_up_to_date, self._stack_names = bring_up_to_date, names
+        self._stacks, self._stack_names = stacks_of_learners, names
         for name, learner in self.learners.items():
             if learner.was_in_stack is not None and learner.was_in_stack != (name in names):
                 before, now = ("stacked", "by itself") if learner.was_in_stack else ("by itself", "stacked")
@@ -366,13 +369,9 @@ def run_together(
     member_ids = {id(learner) for learner in members}
     began = time.perf_counter()
 
-    def bring_up_to_date() -> None:
-        for stack in stacks_of_learners:
-            stack.give()
-
     for training in trainings:
         names = {name for name, learner in training.learners.items() if id(learner) in member_ids}
-        training.runs_stacked(bring_up_to_date, names)
+        training.runs_stacked(stacks_of_learners, names)
     reports: list[TrainingReport | None] = [report] + [None] * (len(trainings) - 1)
     try:
         with one_torch_thread(), _interruption() as stop_requested:

@@ -9,16 +9,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import field, fields
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import RunError
+from cirl_marl.errors import CirlError, RunError
 from cirl_marl.learners.policies import Policies
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record
@@ -41,6 +41,7 @@ class Score:
     service: Annotated[float, "mean level of the service that lacks most; 1 without services"]
     service_bound: Annotated[float, "lower confidence bound of that level, one-sided at 95 %"]
     episode_return: Annotated[float, "mean return of an episode, summed over the agents"]
+    levels: Annotated[Mapping[str, float], "such a bound for each service, by id"] = field(default_factory=dict)
 
     def rank(self, min_service: float | None) -> tuple[bool, float]:
         """Return the key by which scores are compared, the higher the better.
@@ -53,12 +54,17 @@ class Score:
         is_served = self.service_bound >= min_service
         return is_served, self.circularity if is_served else self.service_bound
 
-    def figures(self) -> dict[str, float]:
+    def lacks(self, min_service: float | None) -> dict[str, float]:
+        """Return the services whose bound is below what is demanded, with that bound, the lowest first."""
+        lowest_first = sorted(self.levels.items(), key=lambda service: service[1])
+        return {service: level for service, level in lowest_first if min_service is not None and level < min_service}
+
+    def figures(self) -> dict[str, Any]:
         """Return the figures by their names in files."""
         return {self.NAMES_IN_FILES.get(part.name, part.name): getattr(self, part.name) for part in fields(self)}
 
     @classmethod
-    def from_figures(cls, figures: Mapping[str, float]) -> Score:
+    def from_figures(cls, figures: Mapping[str, Any]) -> Score:
         """Return the score of figures that were written to a file."""
         names = {key: name for name, key in cls.NAMES_IN_FILES.items()}
         return cls(**{names.get(key, key): value for key, value in figures.items()})
@@ -70,16 +76,15 @@ def validation_score(env: MultiAgentVectorEnv, policies: Policies) -> Score:
     levels = run.episode_levels
     spread = levels.std(axis=0, ddof=1) if len(levels) > 1 else np.zeros(levels.shape[1])
     lower_bounds = levels.mean(axis=0) - QUANTILE_95 * spread / math.sqrt(len(levels))
+    ids = [service.id for service in env.network.services]
     return Score(
         circularity=float(run.episode_circularity.mean()),
         service=float(levels.mean(axis=0).min(initial=1.0)),
         service_bound=float(lower_bounds.min(initial=1.0)),
         episode_return=float(run.returns.sum(axis=0).mean()),
+        levels=dict(zip(ids, lower_bounds.tolist(), strict=True)),
     )
 
-
-MULTIPLIER_FROM = 0.5
-"""Share of a run after which the multiplier moves: it has to be slower than those who learn under it."""
 
 LARGEST_MULTIPLIER = 1e3
 """Largest value of the multiplier."""
@@ -103,43 +108,52 @@ def price_step(
 
 
 class ServiceMultiplier:
-    """The Lagrange multiplier p of the demanded service: what a shortfall costs in units of circularity.
+    """The Lagrange multipliers p_s of the demanded services: what a shortfall costs in units of circularity.
 
-    The reward is w·λ/c − (1 − w)·shortfall, so that p = (1 − w)/w. The demanded level s* is a constraint and p its
-    multiplier (Altman 1999, Constrained Markov Decision Processes), moved by a controller with an integral and a
-    proportional part (Stooke et al. 2020, arXiv 2007.03964): ``price_step`` after a validation, with the lower bound
-    of every service. Neither q nor p falls below what p was at first, where learners that serve more than is demanded
-    would give up at once what takes them long to learn. Where one more unit costs about the same over a wide range,
-    they drift through it at any other price, and only the damping, which is at once, stops them.
+    The reward is w·λ/c − (1 − w)·Σ_s φ_s·weight_s·shortfall_s, so that p_s = φ_s·(1 − w)/w; the factor φ_s of the
+    dearest service is 1. The demanded level s* is a constraint and p_s its multiplier (Altman 1999, Constrained Markov
+    Decision Processes), moved by a controller with an integral and a proportional part (Stooke et al. 2020, arXiv
+    2007.03964): ``price_step`` after a validation, with the lower bound of each service. Neither q nor p falls below
+    what p was at first, where learners that serve more than is demanded would give up at once what takes them long to
+    learn. Where one more unit costs about the same over a wide range, they drift through it at any other price, and
+    only the damping, which is at once, stops them.
     """
 
     def __init__(self, env: MultiAgentVectorEnv, min_service: float, rate: float, damping_gain: float) -> None:
         """Begin with the weight that ``env`` has."""
         self._env, self._min_service, self._rate, self._damping_gain = env, min_service, rate, damping_gain
         weight = max(env.circularity_weight, 1.0 / (1.0 + LARGEST_MULTIPLIER))
-        self._least = self._integral = (1.0 - weight) / weight
+        self._least = (1.0 - weight) / weight
+        self._integrals: Floats = np.full(len(env.network.services), self._least)
 
-    def update(self, service: float) -> None:
-        """Move the multiplier after a validation."""
-        moved = price_step(
-            self._integral, service, self._min_service, self._rate, self._damping_gain, least=self._least
+    def update(self, levels: ArrayLike) -> None:
+        """Move the multipliers after a validation that assures ``levels``, shape (services,)."""
+        self._integrals, prices = price_step(
+            self._integrals, levels, self._min_service, self._rate, self._damping_gain, least=self._least
         )
-        self._integral, price = (float(part) for part in moved)
-        self._env.circularity_weight = 1.0 / (1.0 + price)
+        highest = float(prices.max())
+        self._env.circularity_weight = 1.0 / (1.0 + highest)
+        self._env.service_factors = prices / highest if highest else np.ones_like(prices)
 
     def save(self, folder: Path) -> None:
-        """Write the weight and the integral part to a checkpoint."""
-        state = {"circularity_weight": self._env.circularity_weight, "lasting_price": self._integral}
+        """Write the weight, the factors and the integral parts to a checkpoint."""
+        state = {
+            "circularity_weight": self._env.circularity_weight,
+            "service_factors": self._env.service_factors.tolist(),
+            "lasting_price": self._integrals.tolist(),
+        }
         write_json(folder / "price.json", state)
 
     def load(self, folder: Path) -> None:
-        """Load what ``save`` wrote; a ``RunError`` if they are missing or none."""
-        path = folder / "price.json"
+        """Load what ``save`` wrote, or one price of all services; a ``RunError`` if they are missing or none."""
+        path, count = folder / "price.json", len(self._integrals)
         try:
             state = read_record(path)
-            weight, integral = float(state["circularity_weight"]), float(state["lasting_price"])
-            if not (0.0 <= weight <= 1.0 and 0.0 <= integral < math.inf):
-                raise ValueError(f"a weight of {weight} and a price of {integral}")
-        except (KeyError, TypeError, ValueError) as error:
+            weight, factors = float(state["circularity_weight"]), state.get("service_factors", [1.0] * count)
+            integrals = np.broadcast_to(np.array(state["lasting_price"], dtype=np.float64), count).copy()
+            if not (0.0 <= weight <= 1.0 and (np.isfinite(integrals) & (integrals >= 0.0)).all()):
+                raise ValueError(f"a weight of {weight} and prices of {integrals.tolist()}")
+            self._env.service_factors = factors
+        except (CirlError, KeyError, TypeError, ValueError) as error:
             raise RunError(f"{path}: cannot be read: {error!r}; it holds the price of service") from error
-        self._env.circularity_weight, self._integral = weight, integral
+        self._env.circularity_weight, self._integrals = weight, integrals

@@ -38,6 +38,8 @@ FEEDBACK = 0.5
 """Share of a derivative that passes on to what was before through what a policy saw: where agents act on each other
 round the network it would grow from interval to interval without bound. Where each acts as well as it can, what its
 action is worth is zero, and so is what is left out."""
+MARGIN = 0.05
+"""Least margin of a service, in parts of what may lack: where nothing is random its level swings about the demand."""
 LEAST_PRICE = 1e-4
 """Below which no price falls, per circularity scale."""
 
@@ -85,8 +87,8 @@ class GradientStack(Stack):
         if not self._is_restoring:
             first.episode_start = asdict(self._env.physical)
 
-    def _deterministic_actions(self, observations: Tensor) -> Tensor:
-        return self._weights.actor.forward(observations[..., : self._inputs.local])[-1]
+    def _deterministic_actions(self, observations: Tensor, members: slice = slice(None)) -> Tensor:
+        return self._weights.actor.forward(observations[..., : self._inputs.local], members)[-1]
 
     def _give_models(self) -> None:
         self._weights.give()
@@ -164,7 +166,8 @@ class GradientStack(Stack):
         if run.min_service is None:
             return
         doubt = 2.0 * QUANTILE_95 * levels.std(axis=1) / math.sqrt(run.episodes)
-        at_once = (self._integrals, levels.mean(axis=1) - doubt, run.min_service, run.price_rate, run.price_damping)
+        margin = np.maximum(doubt, MARGIN * (1.0 - run.min_service))
+        at_once = (self._integrals, levels.mean(axis=1) - margin, run.min_service, run.price_rate, run.price_damping)
         self._integrals, self._prices = price_step(*at_once, least=LEAST_PRICE)
 
     def _log(self, circularity: float, levels: Floats, rate: float) -> None:

@@ -131,8 +131,8 @@ class RolloutStack(Stack):
             self._collect()
             self._update(1.0 - self._timesteps / total)
 
-    def _deterministic_actions(self, observations: Tensor) -> Tensor:
-        return self._weights.actor.forward(observations[..., : self._inputs.local])[-1]
+    def _deterministic_actions(self, observations: Tensor, members: slice = slice(None)) -> Tensor:
+        return self._weights.actor.forward(observations[..., : self._inputs.local], members)[-1]
 
     def _give_models(self) -> None:
         self._weights.give()

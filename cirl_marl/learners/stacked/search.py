@@ -78,8 +78,8 @@ class SearchStack(Stack):
     def _steps(self) -> int:
         return self._before + self._steps_done
 
-    def _deterministic_actions(self, observations: Tensor) -> Tensor:
-        return self._actions(self._centre, observations)
+    def _deterministic_actions(self, observations: Tensor, members: slice = slice(None)) -> Tensor:
+        return self._actions(self._centre[members], observations)
 
     def _give_models(self) -> None:
         for i, model in enumerate(self._models):

@@ -7,7 +7,7 @@ ones. Spaces of unequal lengths are padded with zeros, which weights that are ze
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,9 +17,11 @@ from numpy.typing import NDArray
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from torch import Tensor
 
+from cirl_marl.controllers.basic import Arrays
 from cirl_marl.learners.agent_env import wait
 from cirl_marl.learners.checkpoint import observation_statistics
 from cirl_marl.learners.learner import Learner
+from cirl_marl.learners.policies import Policies
 from cirl_marl.network import Integers
 
 
@@ -74,7 +76,7 @@ class StackedInputs:
     def observe(self, *, update_moments: bool) -> Tensor:
         """Return the present observations, shape (N, B, entries); ``update_moments`` has them count in the moments."""
         for i, learner in enumerate(self._members):
-            self._enter(i, learner.agent_env.reset())
+            _enter(self._parts, i, learner.agent_env.reset())
         if update_moments and self._follows:
             for key, part in self._parts.items():
                 _update(self._moments[key], part)
@@ -84,8 +86,18 @@ class StackedInputs:
         """Return the last observations of the episodes that ended, shape (N, B, entries); anything in other rows."""
         for i, learner in enumerate(self._members):
             if dones[i].any():
-                self._enter(i, learner.agent_env.last_step.final_observation)
+                _enter(self._parts, i, learner.agent_env.last_step.final_observation)
         return self._normalise()
+
+    def elsewhere(self, observations: Sequence[Any], members: slice) -> Tensor:
+        """Return what ``members`` observe in another environment, normalised, shape (members, rows, entries)."""
+        first = observations[0]
+        count = len(next(iter(first.values())) if isinstance(first, dict) else first)
+        shape = (len(observations), count)
+        parts = {key: np.zeros((*shape, part.shape[2]), dtype=part.dtype) for key, part in self._parts.items()}
+        for i, observation in enumerate(observations):
+            _enter(parts, i, observation)
+        return self._normalise(parts, members)
 
     def rewards_and_dones(self) -> tuple[Tensor, NDArray[np.bool_]]:
         """Return the rewards as normalisers scale them, and which rows ended, shape (N, B) each."""
@@ -134,18 +146,23 @@ class StackedInputs:
             return np.ones((1, 1, 1))
         return np.asarray(1.0 / np.sqrt(self._moments["observation"].var + normaliser.epsilon)[:, None])
 
-    def _enter(self, i: int, observation: Any) -> None:
-        for key, part in self._parts.items():
-            rows = observation[key] if isinstance(observation, dict) else observation
-            part[i, :, : rows.shape[1]] = rows
-
-    def _normalise(self) -> Tensor:
-        normaliser, parts = self._members[0].normaliser, list(self._parts.values())
+    def _normalise(
+        self, observed: Mapping[str, NDArray[np.floating]] | None = None, members: slice = slice(None)
+    ) -> Tensor:
+        normaliser, parts = self._members[0].normaliser, list((observed or self._parts).values())
         if normaliser is not None and normaliser.norm_obs:
             for place, (part, moments) in enumerate(zip(parts, self._moments.values(), strict=True)):
-                standard = (part - moments.mean[:, None]) / np.sqrt(moments.var + normaliser.epsilon)[:, None]
+                mean, var = moments.mean[members], moments.var[members]
+                standard = (part - mean[:, None]) / np.sqrt(var + normaliser.epsilon)[:, None]
                 parts[place] = np.clip(standard, -normaliser.clip_obs, normaliser.clip_obs)
         return torch.as_tensor(np.concatenate(parts, axis=2), dtype=torch.float32, device=self._device)
+
+
+def _enter(parts: Mapping[str, NDArray[np.floating]], i: int, observation: Any) -> None:
+    """Write what learner ``i`` observes into the parts of all."""
+    for key, part in parts.items():
+        rows = observation[key] if isinstance(observation, dict) else observation
+        part[i, :, : rows.shape[1]] = rows
 
 
 def _update(moments: RunningMeanStd, samples: NDArray[np.floating]) -> None:
@@ -181,6 +198,12 @@ class Stack(ABC):
             self._inputs.hand_in(self._deterministic_actions(self._inputs.observe(update_moments=False)))
             wait()
 
+    def predict(self, observations: Sequence[Any], members: slice) -> list[NDArray[np.floating]]:
+        """Return the actions without noise of ``members`` for rows that each observes elsewhere, clipped."""
+        outputs = self._deterministic_actions(self._inputs.elsewhere(observations, members), members).cpu().numpy()
+        boxes = self._inputs.spaces[members]
+        return [np.clip(rows[:, : box.shape[0]], box.low, box.high) for rows, box in zip(outputs, boxes, strict=True)]
+
     @property
     def _is_restoring(self) -> bool:
         """Whether the learners go on from where they were saved, and have not come there yet."""
@@ -204,8 +227,8 @@ class Stack(ABC):
             learner.streams.torch_state = noise.get_state()
 
     @abstractmethod
-    def _deterministic_actions(self, observations: Tensor) -> Tensor:
-        """Return actions without noise, shape (learners, rows, entries), for observations."""
+    def _deterministic_actions(self, observations: Tensor, members: slice = slice(None)) -> Tensor:
+        """Return actions without noise of ``members``, shape (members, rows, entries), for what they observe."""
 
     @abstractmethod
     def _give_models(self) -> None:
@@ -217,3 +240,29 @@ class Stack(ABC):
         wait()
         self._steps_done += 1
         return self._inputs.observe(update_moments=True)
+
+
+class StackedPolicies(Policies):
+    """The policies of learners, those of a stack all at once: the same but for rounding."""
+
+    def __init__(self, learners: Mapping[str, Learner], stacks: Sequence[Stack]) -> None:
+        """Act by ``learners``; stacks may have those of other trainings too, of which each has its own together."""
+        names = {id(learner): name for name, learner in learners.items()}
+        self._parts: list[tuple[Stack, slice]] = []
+        for stack in stacks:
+            places = [i for i, member in enumerate(stack.members) if id(member) in names]
+            if places:
+                self._parts.append((stack, slice(places[0], places[-1] + 1)))
+        in_stacks = {id(member) for stack, part in self._parts for member in stack.members[part]}
+        rest = {name: learner.policy for name, learner in learners.items() if id(learner) not in in_stacks}
+        super().__init__(rest)
+
+    def act(self, observations: Arrays) -> Arrays:
+        """Return the deterministic actions of all agents."""
+        actions = dict(super().act(observations))
+        for stack, part in self._parts:
+            views = [member.agent_env.view for member in stack.members[part]]
+            rows = stack.predict([view.observe(observations, self._state) for view in views], part)
+            for view, action in zip(views, rows, strict=True):
+                actions.update(view.act(action))
+        return actions
