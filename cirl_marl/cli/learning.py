@@ -26,7 +26,13 @@ def train(
     network: Annotated[
         str | None, typer.Argument(metavar="NETWORK", help="Catalogue name, FILE.toml or FILE.toml:REGION.")
     ] = None,
-    recipe: Annotated[str, typer.Option(help="Who learns how: catalogue name or .toml file.")] = "independent_ars",
+    recipe: Annotated[
+        str | None,
+        typer.Option(
+            help="Who learns how: catalogue name or .toml file; default: exact_gradients, or independent_ars where the "
+            "network has no derivatives."
+        ),
+    ] = None,
     agents: Annotated[
         str | None, typer.Option(help="Who acts and learns, comma-separated ids; default: the network's choice.")
     ] = None,
@@ -66,6 +72,7 @@ def train(
 
     Ctrl-C, SIGTERM and SIGHUP save the run and end with code 130: it is interrupted, and --resume goes on with it.
     """
+    from cirl_marl.definitions.catalogue import load_network
     from cirl_marl.learners import interface
 
     if network is None and resume is None:
@@ -79,7 +86,9 @@ def train(
     names = None if agents is None else common.comma_separated(agents)
     options |= {"observe": observe, "agents": names, "device": device}
     all_seeds = range(seed, seed + seeds)
-    directories = [resume] if resume is not None else _directories(out, str(network), recipe, all_seeds)
+    if resume is None and recipe is None:
+        recipe = interface.default_recipe(load_network(str(network), scenario=scenario))
+    directories = [resume] if resume is not None else _directories(out, str(network), str(recipe), all_seeds)
     with common.training_bar() as report:
         options["report"] = report
         try:

@@ -23,7 +23,7 @@ from cirl_marl.dynamics.rate_adjoint import RateAdjoint
 from cirl_marl.dynamics.routing import IntervalRoutes
 from cirl_marl.dynamics.taylor import Taylor
 from cirl_marl.errors import CirlError
-from cirl_marl.network import Floats, Integers
+from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Law
 from cirl_marl.network.rowsum import RowSum
@@ -166,19 +166,23 @@ class Adjoint:
         return flow_worth
 
 
+def derivative_obstacle(network: Network) -> str:
+    """Return why a network has no derivatives here; empty if it has."""
+    for compartment in network.compartments.values():
+        if compartment.model is not None:
+            model = type(compartment.model).__name__
+            return f"compartment '{compartment.id}' has a model, {model}, whose physics is not linear"
+    for arc in network.arcs:
+        if arc.law is Law.BATCH:
+            return f"arc '{arc.id}' moves mass in batches"
+    solver = network.episode.solver
+    exact = "derivatives are of the exact solver (leave out solver and solver_step)"
+    return "" if solver == "exact" else f"solver '{solver}' moves it; {exact}"
+
+
 def _differentiable(dynamics: Dynamics) -> Taylor:
     """Return the solver, or say why what it moves has no derivative here."""
-    network, reason = dynamics.network, ""
-    batch_arcs = [arc.id for arc in network.arcs if arc.law is Law.BATCH]
-    if dynamics.inner.owners:
-        owner = dynamics.inner.owners[0]
-        model = type(network.compartments[owner].model).__name__
-        reason = f"compartment '{owner}' has a model, {model}, whose physics is not linear"
-    elif batch_arcs:
-        reason = f"arc '{batch_arcs[0]}' moves mass in batches"
-    elif dynamics.taylor is None:
-        solver = network.episode.solver
-        reason = f"solver '{solver}' moves it; derivatives are of the exact solver (leave out solver and solver_step)"
-    if dynamics.taylor is None or reason:
-        raise CirlError(f"network '{network.name}' cannot be differentiated: {reason}")
+    if reason := derivative_obstacle(dynamics.network):
+        raise CirlError(f"network '{dynamics.network.name}' cannot be differentiated: {reason}")
+    assert dynamics.taylor is not None
     return dynamics.taylor

@@ -18,6 +18,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.definitions.reader import write_network
+from cirl_marl.dynamics.adjoint import derivative_obstacle
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RecipeError, RunError, unknown_name, whole_number
 from cirl_marl.learners.agent_env import AgentVecEnv
@@ -32,9 +33,18 @@ from cirl_marl.network import Network
 from cirl_marl.records.files import publish_folder
 
 
+def default_recipe(network: Network) -> str:
+    """Return the name of the recipe by which a network learns if none is given.
+
+    It is ``exact_gradients`` where the simulator has derivatives, else ``independent_ars``; both have independent
+    learners who see what is local.
+    """
+    return "independent_ars" if derivative_obstacle(network) else "exact_gradients"
+
+
 def train(
     network: str | Path | Network,
-    recipe: str | Path | Recipe = "independent_ars",
+    recipe: str | Path | Recipe | None = None,
     *,
     directory: str | Path | None = None,
     steps: int | None = None,
@@ -55,7 +65,7 @@ def train(
 
     Args:
         network: catalogue name, definition file, or network.
-        recipe: catalogue name, recipe file, or recipe.
+        recipe: catalogue name, recipe file, or recipe; None takes that of ``default_recipe``.
         directory: where the run is kept; None keeps it in memory only.
         steps: environment steps, summed over the copies; None takes the recipe's.
         envs: copies of the environment; None takes the recipe's.
@@ -87,7 +97,7 @@ def train(
 
 def train_seeds(
     network: str | Path | Network,
-    recipe: str | Path | Recipe = "independent_ars",
+    recipe: str | Path | Recipe | None = None,
     *,
     seeds: Sequence[int],
     directory: str | Path | None = None,
@@ -107,7 +117,7 @@ def train_seeds(
 
 def _train(
     network: str | Path | Network,
-    recipe: str | Path | Recipe,
+    recipe: str | Path | Recipe | None,
     runs: Sequence[tuple[int, str | Path | None]],
     *,
     callbacks: Mapping[str, BaseCallback] | None = None,
@@ -132,7 +142,7 @@ def _train(
 
 def prepare(
     network: str | Path | Network,
-    recipe: str | Path | Recipe,
+    recipe: str | Path | Recipe | None,
     *,
     steps: int | None = None,
     envs: int | None = None,
@@ -144,6 +154,9 @@ def prepare(
     **options: Any,
 ) -> Training:
     """Return the training that ``train`` would start with these arguments; nothing is trained and nothing written."""
+    if recipe is None:
+        network = load_network(network) if isinstance(network, str | Path) else network
+        recipe = default_recipe(network.scenario(options.get("scenario")))
     full_recipe = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
     steps = full_recipe.run.steps if steps is None else whole_number("steps", steps, 1)
     if engine is not None and engine not in ENGINES:

@@ -205,6 +205,11 @@ class Training:
         return members
 
     @property
+    def best(self) -> Score | None:
+        """Figures of the checkpoint that acts; None if none was evaluated."""
+        return self._best
+
+    @property
     def joint_steps(self) -> int:
         """Joint steps done, those before a resumption included."""
         return self.world.joint_steps

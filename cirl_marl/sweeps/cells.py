@@ -85,15 +85,19 @@ def cells_of(file: SweepFile) -> list[Cell]:
     Raises:
         CirlError: for a combination that cannot be trained, before anything is written.
     """
-    from cirl_marl.learners.interface import prepare  # it needs torch
+    from cirl_marl.learners.interface import default_recipe, prepare  # they need torch
 
     cells = []
-    recipes = [load_recipe(name) for name in file.recipes]
+    recipes = {
+        address: [load_recipe(name) for name in file.recipes or [default_recipe(load_network(address))]]
+        for address in file.networks
+    }
     lists = {key: values for key, values in file.options.model_dump().items() if values is not None}
     scenarios: list[str | None] = [*file.scenarios] if file.scenarios is not None else [None]
-    for seed, address, scenario, recipe, *values in itertools.product(
-        file.seeds, file.networks, scenarios, recipes, *lists.values()
+    for seed, address, scenario, number, *values in itertools.product(
+        file.seeds, file.networks, scenarios, range(len(recipes[file.networks[0]])), *lists.values()
     ):
+        recipe = recipes[address][number]
         options = dict(zip(lists, values, strict=True))
         network = load_network(address, scenario=scenario or recipe.environment.get("scenario"))
         begins = any(learner.start is not None for _, learner in recipe.learners())

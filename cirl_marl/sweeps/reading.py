@@ -66,12 +66,12 @@ class SweepFile(Settings):
 
     Attributes:
         networks: names of the catalogue, or files, which count from the folder of the sweep file.
-        recipes: likewise.
+        recipes: likewise; None takes the default one of each network.
         scenarios: of every network; None takes the recipe's, else the default one.
     """
 
     networks: NonEmptyList[StrictStr]
-    recipes: NonEmptyList[StrictStr] = Field(["independent_ars"])
+    recipes: NonEmptyList[StrictStr] | None = None
     scenarios: NonEmptyList[StrictStr] | None = None
     seeds: NonEmptyList[SeedNumber] = Field([0])
     options: SweepOptions = SweepOptions()
