@@ -198,9 +198,9 @@ class Run(Settings):
     )
     price_rate: Annotated[Number, Field(ge=0)] = Field(
         0.0,
-        description="largest step of the logarithm of the price of a shortfall of service, which moves after each "
-        "evaluation in the second half of a run, until min_service is reached; of each service apart, and after each "
-        "episode, with engine gradients; 0: the price stays that of circularity_weight",
+        description="largest step of the logarithm of the price of a shortfall, each service's own, which moves after "
+        "each evaluation until min_service is reached, after each episode with engine gradients; 0: the price stays "
+        "that of circularity_weight",
     )
     price_damping: Annotated[Number, Field(ge=0)] = Field(
         0.0,
