@@ -7,8 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from small_networks import ONE_OF_EACH
 
-from cirl_marl import RecipeError, load_network, train
+from cirl_marl import MultiAgentVectorEnv, RecipeError, load_network, train
+from cirl_marl.environments.derivatives import Derivatives
+from cirl_marl.errors import CirlError
+from cirl_marl.learners.interface import default_recipe, prepare
 from cirl_marl.learners.recipe import LearnerSettings, Recipe, Run
 from cirl_marl.learners.stacked import gradient_ascent
 from cirl_marl.learners.stacked.gradient_ascent import GradientStack
@@ -119,3 +123,25 @@ def test_who_cannot_climb(changes: dict[str, Any], options: dict[str, Any], reas
     """Is told why, before anything is learnt."""
     with pytest.raises(RecipeError, match=f"engine gradients: {reason}"):
         train("copper_net", recipe(**changes), **options)
+
+
+@pytest.mark.medium
+@pytest.mark.sample(4)
+@pytest.mark.parametrize("name", ONE_OF_EACH)
+def test_what_has_derivatives_learns_by_them_if_no_recipe_is_given(name: str) -> None:
+    """And what has none learns by random search."""
+    network = load_network(name)
+    chosen = default_recipe(network)
+    try:
+        Derivatives(MultiAgentVectorEnv(network, num_envs=1))
+    except CirlError as error:
+        assert chosen == "independent_ars" and "cannot be differentiated" in str(error)
+    else:
+        assert chosen == "exact_gradients"
+    assert prepare(network, None).config.recipe.name == chosen
+
+
+def test_a_scenario_may_have_another_recipe() -> None:
+    """The paper's has a solver of its own, without derivatives."""
+    assert prepare("copper_net", None, scenario="paper").config.recipe.name == "independent_ars"
+    assert prepare("copper_net", None, scenario="outages").config.recipe.name == "exact_gradients"
