@@ -161,7 +161,7 @@ def test_train_evaluate_report(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     assert run(monkeypatch, "report", "run", "--episodes", "4", "--html", "pages/run.html") == 0
     told = shown(Path("pages/run.html").read_text(encoding="utf-8"))
     names = [scene["name"] for scene in told["scenes"]]
-    assert names == ["business as usual", "trained, independent ars", "plan of the bound"]
+    assert names == ["business as usual", "trained, exact gradients", "plan of the bound"]
     assert told["scenes"][1]["figures"]["gap"][0] > 0 and "mean of 4 episodes" in told["scenes"][1]["about"]
 
 
@@ -188,7 +188,7 @@ def test_demo_trains_compares_and_opens_its_report(
     said = f"report: {page} (open it in a browser; it needs no server)"
     assert said in " ".join(capsys.readouterr().out.split()) and opened == []
     names = [scene["name"] for scene in shown(page.read_text(encoding="utf-8"))["scenes"]]
-    assert names == ["business as usual", "trained, independent ars", "plan of the bound"]
+    assert names == ["business as usual", "trained, exact gradients", "plan of the bound"]
     steps = RunDirectory(Path("runs/demo")).status["joint_steps"]
     monkeypatch.setenv("DISPLAY", ":0")
     assert run(monkeypatch, "demo") == 0
