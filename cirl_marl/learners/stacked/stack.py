@@ -89,7 +89,7 @@ class StackedInputs:
                 _enter(self._parts, i, learner.agent_env.last_step.final_observation)
         return self._normalise()
 
-    def elsewhere(self, observations: Sequence[Any], members: slice) -> Tensor:
+    def normalise(self, observations: Sequence[Any], members: slice) -> Tensor:
         """Return what ``members`` observe in another environment, normalised, shape (members, rows, entries)."""
         first = observations[0]
         count = len(next(iter(first.values())) if isinstance(first, dict) else first)
@@ -147,9 +147,9 @@ class StackedInputs:
         return np.asarray(1.0 / np.sqrt(self._moments["observation"].var + normaliser.epsilon)[:, None])
 
     def _normalise(
-        self, observed: Mapping[str, NDArray[np.floating]] | None = None, members: slice = slice(None)
+        self, blocks: Mapping[str, NDArray[np.floating]] | None = None, members: slice = slice(None)
     ) -> Tensor:
-        normaliser, parts = self._members[0].normaliser, list((observed or self._parts).values())
+        normaliser, parts = self._members[0].normaliser, list((blocks or self._parts).values())
         if normaliser is not None and normaliser.norm_obs:
             for place, (part, moments) in enumerate(zip(parts, self._moments.values(), strict=True)):
                 mean, var = moments.mean[members], moments.var[members]
@@ -200,7 +200,7 @@ class Stack(ABC):
 
     def predict(self, observations: Sequence[Any], members: slice) -> list[NDArray[np.floating]]:
         """Return the actions without noise of ``members`` for rows that each observes elsewhere, clipped."""
-        outputs = self._deterministic_actions(self._inputs.elsewhere(observations, members), members).cpu().numpy()
+        outputs = self._deterministic_actions(self._inputs.normalise(observations, members), members).cpu().numpy()
         boxes = self._inputs.spaces[members]
         return [np.clip(rows[:, : box.shape[0]], box.low, box.high) for rows, box in zip(outputs, boxes, strict=True)]
 
