@@ -185,12 +185,20 @@ def test_each_service_has_its_price(tmp_path: Path, reward: str) -> None:
         env.service_factors = [1.0]
 
 
-def test_what_lacks_is_named() -> None:
-    """The services below what is demanded, the lowest first, and none where none is."""
-    score = Score(0.0, 0.9, 0.9, 0.0, {"heat": 0.98, "steel": 0.9, "paper": 1.0})
-    assert score.lacks(0.99) == {"steel": 0.9, "heat": 0.98} and list(score.lacks(0.99)) == ["steel", "heat"]
-    assert not score.lacks(None) and not score.lacks(0.5)
-    assert Score.from_figures(score.figures()) == score
+def test_what_lacks_is_named(tmp_path: Path) -> None:
+    """The services below what is demanded, the lowest first; a run from before they were kept names none."""
+    train("carbo_net", recipe(min_service=0.99), directory=tmp_path / "run", horizon=HORIZON)
+    run = RunDirectory(tmp_path / "run")
+    status = json.loads((run.path / "status.json").read_text())
+    figures = status["best"]["figures"]
+    assert Score.from_figures(figures).figures() == figures
+    assert min(figures["levels"].values()) == figures["assured"] and len(figures["levels"]) == 2
+    first, second = figures["levels"]
+    figures |= {"assured": 0.9, "levels": {first: 0.98, second: 0.9}}
+    for levels, said in ((figures["levels"], f"demands ({second} 0.9000, {first} 0.9800)"), ({}, "demands")):
+        figures["levels"] = levels
+        (run.path / "status.json").write_text(json.dumps(status))
+        assert acting_checkpoint(run).endswith(said)
 
 
 def test_one_episode_is_enough_where_nothing_is_random(tmp_path: Path) -> None:

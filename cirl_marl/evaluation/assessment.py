@@ -16,7 +16,6 @@ from cirl_marl.evaluation.comparison import Comparison, compare
 from cirl_marl.evaluation.figures import summary
 from cirl_marl.evaluation.statistics import over_episodes
 from cirl_marl.learners.run_directory import RunDirectory
-from cirl_marl.learners.validation import Score
 from cirl_marl.records.files import read_record, write_json
 
 CONTROLLERS = ("neutral", "random")
@@ -134,7 +133,6 @@ def acting_checkpoint(run: RunDirectory) -> str:
     )
     if demand is not None and figures["assured"] < demand:
         sentence += f"; none assured the service of {demand:g} that the recipe demands"
-        lacks = Score.from_figures(figures).lacks(demand)
-        if lacks:
-            sentence += " (" + ", ".join(f"{id_} {level:.4f}" for id_, level in lacks.items()) + ")"
+        lacks = sorted((level, service) for service, level in figures.get("levels", {}).items() if level < demand)
+        sentence += f" ({', '.join(f'{service} {level:.4f}' for level, service in lacks)})" if lacks else ""
     return sentence

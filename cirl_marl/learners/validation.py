@@ -54,11 +54,6 @@ class Score:
         is_served = self.service_bound >= min_service
         return is_served, self.circularity if is_served else self.service_bound
 
-    def lacks(self, min_service: float | None) -> dict[str, float]:
-        """Return the services whose bound is below what is demanded, with that bound, the lowest first."""
-        lowest_first = sorted(self.levels.items(), key=lambda service: service[1])
-        return {service: level for service, level in lowest_first if min_service is not None and level < min_service}
-
     def figures(self) -> dict[str, Any]:
         """Return the figures by their names in files."""
         return {self.NAMES_IN_FILES.get(part.name, part.name): getattr(self, part.name) for part in fields(self)}
