@@ -403,7 +403,7 @@ def test_supplies_keep_the_proportions_that_the_program_knows(
     mines = [planned.arc_index[each] for each in ("mine_a", "mine_b")]
     uncut = np.ones((steps, len(planned.arcs)), dtype=bool)
     uncut[:, mines[0]] = ore > 1e3
-    reached = Reach(np.zeros((steps, len(planned.nodes))), uncut, np.zeros(steps))
+    reached = Reach(np.zeros((steps, len(planned.nodes))), 1.0 * uncut, np.zeros(steps), 0.0 * uncut)
     written = ProgramRows(layout, steps)
     idle_supplies(programs.admissible, reached, range(steps), written)
     rows, limits = written.matrices()[0], written.limits()

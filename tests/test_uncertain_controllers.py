@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from small_networks import KINDS
 from test_mpc import ORDER, in_use
 from test_optimum import certifiable
-from test_uncertain_bound import DEMAND, Paths, stockist, works
+from test_uncertain_bound import DEMAND, Paths, best_stockist, stockist, works
 
 from cirl_marl import CirlError, MultiAgentVectorEnv, Network, NetworkError, bound, compare, gradient
 from cirl_marl.controllers import Controller
@@ -169,6 +169,21 @@ def test_feedback_is_between_the_blind_and_the_best() -> None:
     assert merits["scenario"] > best + 0.02 * best
     assert merits["schedule"] < merits["scenario"] - 0.02 * abs(best)
     assert merits["constant"] <= merits["schedule"] + 1e-3 * abs(best)
+
+
+@pytest.mark.medium
+def test_what_is_sold_is_not_held_back_in_plans() -> None:
+    """Of a store that sells what it holds, scenario MPC orders as the best policy does; plans cannot ration sales."""
+    network, price = stockist(5), 1.7
+    paths, best = Paths.of(network), best_stockist(network, price)
+    drawn = network.processes.sample(range(first_seed(0), first_seed(0) + 800)).states[:5, 0].T
+    merits, env = list[float](), MultiAgentVectorEnv(network, num_envs=1)
+    for path in paths.regimes:
+        seed = first_seed(0) + int((drawn == path).all(axis=1).argmax())
+        run = rollout(env, MPC(service_weight=price / network.objective.circularity_scale, futures=2), seed=seed)
+        np.testing.assert_array_equal(run.disturbances[0, :, 0] > 1, path == 1)
+        merits.append(float(run.episode_circularity[0] + price * run.episode_levels[0, 0]))
+    assert best - 1e-3 <= paths.chance @ np.array(merits) <= best + 1e-6
 
 
 def test_batches_do_as_they_do_alone_and_seeds_reproduce() -> None:

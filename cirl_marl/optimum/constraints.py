@@ -255,6 +255,27 @@ def idle_supplies(admissible: Admissible, reach: Reach, intervals: range, rows: 
                 rows.limit(row, sign * (low[:, arcs] - slope * low[t, last]) + allowance)
 
 
+def least_deliveries(admissible: Admissible, reach: Reach, intervals: range, rows: ProgramRows) -> None:
+    """Add c·u·x_start − U, at most 0, of what is asked at least by schedule, u, and may be cut; keys (2, …).
+
+    A donor delivers min(1, x_start·s/u_all) of it, concave in x_start, and so at least its chord c·x_start from 0. Of
+    the stocks at the very start, which are known, and of coarse pieces nothing is said.
+    """
+    layout, donors = rows.layout, rows.layout.network.donors
+    if layout.coarse:
+        return
+    least = admissible.rate[0, intervals.start : intervals.stop]
+    in_stages = np.isin(donors, [layout.network.node_index[whole.node.id] for whole in admissible.lifetimes.whole])
+    steps, arcs = np.nonzero(admissible.by_schedule & (least > 0) & ~reach.uncut & ~in_stages)
+    for piece in range(layout.pieces):
+        has_start = steps > 0 if piece == 0 else np.ones(len(steps), dtype=bool)
+        t, k = steps[has_start], arcs[has_start]
+        start = t * layout.size + layout.end[piece - 1] - (layout.size if piece == 0 else 0)
+        row = rows.add(2, t, k, piece)
+        rows.put(row, start + donors[k], least[t, k] * reach.chord[t, k])
+        rows.put(row, t * layout.size + layout.flow[piece * (layout.degree + 1)] + k, -1.0)
+
+
 def _idle_groups(admissible: Admissible) -> list[tuple[Integers, Floats]]:
     """Return the idle arcs of each service that several make up for, with their weights w.
 

@@ -24,6 +24,7 @@ from cirl_marl.optimum.constraints import (
     flow_laws,
     held_controls,
     idle_supplies,
+    least_deliveries,
     service_levels,
     throughputs,
     valve_envelopes,
@@ -196,6 +197,7 @@ class Programs:
         rows = ProgramRows(layout, steps)
         valve_envelopes(admissible, reach, intervals, rows)
         idle_supplies(admissible, reach, intervals, rows)
+        least_deliveries(admissible, reach, intervals, rows)
         from_start = rows.matrices()[0]
         from_start.eliminate_zeros()
         lifetime_rows, lifetime_limits = lifetimes.rows(layout, initial, intervals)
@@ -235,7 +237,9 @@ def _reach(lifetimes: Lifetimes, system: ComparisonSystem, initial: Floats, inte
     ]
     upper = reach.upper @ lifetimes.nodes_reached.T
     lifetime_flow = np.array(most).reshape(len(most), len(steps)).T
-    return Reach(upper, reach.uncut[:, lifetimes.arcs_reached], reach.inflow), lifetime_flow
+    return Reach(
+        upper, reach.delivered[:, lifetimes.arcs_reached], reach.inflow, reach.chord[:, lifetimes.arcs_reached]
+    ), lifetime_flow
 
 
 def _layout(admissible: Admissible, substeps: int, merge_pieces: bool | None, degree: int) -> Layout:
@@ -268,9 +272,9 @@ def _box(
     stores, nodes, arcs = len(network.stores), len(network.nodes), len(network.arcs)
     low, high = np.zeros((2, len(reach.upper), layout.size))
     rate, valve = admissible.rate[:, period], admissible.valve[:, period]
-    # no weighted mean exceeds the supremum: F ≤ r̄·x̄_p, and U ≤ ū; U ≥ u̲ only where nothing is ever cut
+    # no weighted mean exceeds the supremum: F ≤ r̄·x̄_p, and U ≤ ū; of u̲ that much is delivered
     most = rate[1] * np.where(by_schedule, 1.0, reach.upper[:, admissible.driver])
-    least = np.where(by_schedule & reach.uncut, rate[0], 0.0)
+    least = np.where(by_schedule, rate[0] * reach.delivered, 0.0)
     most[:, admissible.lifetimes.exit_arcs] = lifetime_flow
     for stock, flow, through in zip(layout.stock, layout.flow, layout.valve, strict=True):
         high[:, stock:flow] = reach.upper
