@@ -1,34 +1,37 @@
 """One question answered from end to end, for ``docs/japan.md``: what Japan can do by 2050 to cut ore and losses.
 
-python -m benchmarks.japan             # levers and their order, and how sure it is (a quarter of an hour)
-python -m benchmarks.japan --run RUN   # with agents trained by cirl train steel_japan, as well
+python -m benchmarks.japan               # levers and their order, and how sure it is (a quarter of an hour)
+python -m benchmarks.japan --only later  # some sections, here what to decide now and what later
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.document import write_sections
+from benchmarks.japan_decisions import decisions
 from cirl_marl import Levers, MultiAgentVectorEnv, levers, load_network
 from cirl_marl.controllers import Constant, Neutral
 from cirl_marl.controllers.rollout import episode_start, rollout
-from cirl_marl.evaluation import Comparison, compare
 from cirl_marl.evaluation.sampling import sample_episodes, sensitivities
-from cirl_marl.learners.run_directory import RunDirectory
-from cirl_marl.network import Floats, Network
+from cirl_marl.network import Network
 from cirl_marl.optimum import gap
 from cirl_marl.report.decisions import savings
 from cirl_marl.report.lever_chart import save_levers
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "japan.md"
 NAME = "steel_japan"
-SAMPLES, EPISODES = 500, 8
+SAMPLES = 500
 TOGETHER = {"what is exported, steel or goods": ("semis_exports", "long_exports", "flat_exports", "goods_exports")}
 """Agents of one decision: what Japan exports, whatever its form."""
+SECTIONS = ("saved", "levers", "lives", "spread", "later")
+"""Parts of the document that are measured."""
+ORE = {"ore": ("mining", "ore_imports")}
+"""What makes up for what is lacking in the world without shocks, and is a decision where demand is not known."""
 
 
 def question(result: Levers) -> Iterator[str]:
@@ -90,53 +93,25 @@ def spread(network: Network) -> Iterator[str]:
         yield f"| `{found.names[i]}` | {max(0.0, cause.shares[i]):.0%} ± {cause.margins[i]:.0%} |"
 
 
-def under_uncertainty(run: Path | None) -> Iterator[str]:
-    """Yield who comes how far if nobody knows the numbers exactly."""
-    runs = [] if run is None else [RunDirectory(run)]
-    certain = compare(runs, ("neutral", "optimum", "mpc"), network=NAME, episodes=2, min_service=1.0, uncertain=False)
-    drawn = compare(
-        runs, ("neutral", "optimum", "mpc"), network=NAME, episodes=EPISODES, min_service=1.0, uncertain=True
-    )
-    yield f"| who | λ̄, Mt/a, numbers known | gap | λ̄, {EPISODES} draws | lowest service | bound | gap |"
-    yield "|-|-|-|-|-|-|-|"
-    exact = _figures(certain)
-    for name, (circularity, service, best, off) in _figures(drawn).items():
-        known = exact[name]
-        yield (
-            f"| {name} | {known[0] / 1e3:.2f} | {known[3]:.1%} | {circularity / 1e3:.2f} | {service:.4f} "
-            f"| {best / 1e3:.2f} | {off:.1%} |"
-        )
-
-
-def _figures(found: Comparison) -> Mapping[str, tuple[float, float, float, float]]:
-    """Return λ̄, the lowest service, the bound and the gap of each row, means over the episodes."""
-    figures = {}
-    for row in found.rows:
-        entry = row.entries[0]
-        assert entry.bound is not None and entry.gap is not None
-        least: Floats = entry.rollout.least_service
-        means = [float(np.mean(each)) for each in (entry.circularity, least, entry.bound, entry.gap)]
-        figures[row.name] = (means[0], means[1], means[2], means[3])
-    return figures
-
-
 def main() -> None:
     """Write the measured parts of the document."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--run", type=Path, help="agents trained by cirl train steel_japan")
+    parser.add_argument("--only", help=f"sections, of {', '.join(SECTIONS)}; default: all")
     asked = parser.parse_args()
     network = load_network(NAME)
-    result = levers(network, groups=TOGETHER)
-    save_levers(DOCUMENT.parent / "pictures" / "japan_levers.png", result)
-    parts = {
-        "saved": question(result),
-        "levers": order(result),
+    sections = SECTIONS if asked.only is None else tuple(asked.only.split(","))
+    parts: dict[str, Iterator[str]] = {}
+    if {"saved", "levers"} & {*sections}:
+        result = levers(network, groups=TOGETHER)
+        save_levers(DOCUMENT.parent / "pictures" / "japan_levers.png", result)
+        parts = {"saved": question(result), "levers": order(result)}
+    parts |= {
         "lives": lives(),
         "spread": spread(network),
-        "known": under_uncertainty(asked.run),
+        "later": decisions(NAME, {**ORE, **TOGETHER}),
     }
-    for name, lines in parts.items():
-        write_sections(DOCUMENT, {name: "\n".join(lines)})
+    for name in sections:
+        write_sections(DOCUMENT, {name: "\n".join(parts[name])})
 
 
 if __name__ == "__main__":

@@ -1,0 +1,126 @@
+"""What Japan has to decide now and what it may decide later, for ``docs/japan.md``: each lever settled beforehand.
+
+Who looks every year acts by the price policy. A lever is settled if it follows, whatever happens, the mean of what that
+policy did with it in other futures. What that costs, at equal expected service and in the same futures, is the worth of
+deciding later.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from benchmarks.foresight import RESULTS, proof
+from benchmarks.uncertain import DEMANDED, WORLDS, contenders
+from benchmarks.uncertain import RESULTS as KNOBS
+from cirl_marl import MultiAgentVectorEnv
+from cirl_marl.controllers import Controller
+from cirl_marl.controllers.basic import Arrays
+from cirl_marl.controllers.rollout import first_seed, rollout
+from cirl_marl.evaluation.statistics import Aggregate, over_episodes
+from cirl_marl.network import Floats, Network
+from cirl_marl.optimum.blind import Replay
+from cirl_marl.optimum.draw_proofs import Sampling
+from cirl_marl.optimum.mpc import MPC
+
+DRAWS, EARLIER_DRAWS = 32, 32
+"""Futures in which policies are held against each other, and others over which what is settled is averaged."""
+YEARS = 5
+"""At the beginning and at the end, of which means are told."""
+
+
+class Watched(Controller):
+    """Another controller, of which is kept what it does.
+
+    Attributes:
+        actions: stacked, of each interval.
+    """
+
+    def __init__(self, controller: Controller) -> None:
+        """Take it."""
+        self._controller = controller
+
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
+        """Start it."""
+        self._env, self.actions = env, list[Floats]()
+        self._controller.start(env, seed)
+
+    def act(self, observations: Arrays) -> Arrays:
+        """Return what it does."""
+        actions = self._controller.act(observations)
+        self.actions.append(self._env.stack(actions))
+        return actions
+
+
+class Settled(Controller):
+    """Another controller, of which what some agents do is settled beforehand."""
+
+    def __init__(self, controller: Controller, agents: Sequence[str], schedule: Floats) -> None:
+        """Take who acts, whose actions are settled, and a schedule of all actions, shape (intervals, entries)."""
+        self._controller, self._agents, self._replay = controller, tuple(agents), Replay(schedule)
+
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
+        """Start both."""
+        self._controller.start(env, seed)
+        self._replay.start(env, seed)
+
+    def act(self, observations: Arrays) -> Arrays:
+        """Return the actions."""
+        settled = self._replay.act(observations)
+        return {**self._controller.act(observations), **{agent: settled[agent] for agent in self._agents}}
+
+
+def levers_of(network: Network, groups: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, ...]]:
+    """Return the levers, groups of agents by their names, and each agent that is in no group by its label."""
+    grouped = {agent for agents in groups.values() for agent in agents}
+    single = {network.compartments[agent].label: (agent,) for agent in network.agents if agent not in grouped}
+    return {**{name: tuple(agents) for name, agents in groups.items()}, **single}
+
+
+def decisions(name: str, groups: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    """Yield what it costs to settle each lever now instead of following what happens, and the regret of a plan."""
+    world = next(world for world in WORLDS if world.network == name)
+    found, _ = proof(world, Sampling(draws=200, fit_draws=64, numbers=False))
+    network, seed = found.network, found.sampling.seed
+    knob = json.loads(RESULTS.read_text())[name]["contenders"]["price_policy"]["knob"]
+    plan_knob = json.loads(KNOBS.read_text())[name]["contenders"]["plan"]["knob"]
+
+    def looking() -> MPC:
+        return MPC(min_service=DEMANDED, prices=found.prices, margin=knob)
+
+    def losses(controller: Controller) -> Floats:
+        run = rollout(MultiAgentVectorEnv(network, num_envs=DRAWS), controller, seed=first_seed(seed))
+        return found.scale * found.gaps(run.episode_circularity, run.episode_levels)
+
+    env, watched = MultiAgentVectorEnv(network, num_envs=EARLIER_DRAWS), Watched(looking())
+    rollout(env, watched, seed=first_seed(seed + 1))
+    actions = np.array(watched.actions)
+    means, spread = (env.unstack(part.T) for part in (actions.mean(axis=2), actions.std(axis=2)))
+    levers, least = levers_of(network, groups), losses(looking())
+
+    def regret(controller: Controller) -> Aggregate:
+        return over_episodes((losses(controller) - least) / 1e3)
+
+    settled = {lever: regret(Settled(looking(), agents, actions.mean(axis=2))) for lever, agents in levers.items()}
+    first, last = slice(0, YEARS), slice(-YEARS, None)
+    yield "| lever, in % of its range | first five years | last five | spread | settled now, Mt/a |"
+    yield "|-|-|-|-|-|"
+    for lever in sorted(levers, key=lambda lever: -settled[lever].value):
+        shares = [
+            50 * np.mean([part[agent][years] + offset for agent in levers[lever]])
+            for part, years, offset in ((means, first, 1.0), (means, last, 1.0), (spread, slice(None), 0.0))
+        ]
+        yield f"| {lever} | {' | '.join(f'{share:.0f}' for share in shares)} | {_interval(settled[lever])} |"
+    everything = regret(Settled(looking(), network.agents, actions.mean(axis=2)))
+    plan = regret(contenders(world, network)["plan"](plan_knob))
+    yield f"| all of them | | | | {_interval(everything)} |"
+    yield f"| the plan for what is expected | | | | {_interval(plan)} |"
+    yield ""
+    loss = over_episodes(least / 1e3)
+    yield f"Means of {DRAWS} futures, 95 % intervals. Who looks every year is {_interval(loss)} Mt/a from the bound."
+
+
+def _interval(figure: Aggregate) -> str:
+    return f"{figure.value:+.2f} ± {(figure.high - figure.low) / 2:.2f}"
