@@ -8,16 +8,22 @@ With ``--family lifetimes`` there are more products, and one to thirty of these 
 of which agents prolong; some services are made up for from a mine, by agents or as usual.
 
 For each network the command bounds λ̄ with every service met at 95 %, verifies the certificate, and improves the plan
-until it keeps the services and comes within 1 % of the bound, or a minute has passed.
+until it keeps the services and comes within 1 % of the bound, or a minute has passed. Seeds are taken in an order drawn
+once, so that those done so far are a fair sample; ``--kept FILE`` remembers them, and goes on where it was stopped.
 """
 
 from __future__ import annotations
 
+import json
+import multiprocessing
+import resource
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field
 from functools import partial
+from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -51,6 +57,8 @@ DURABLE = 4.0
 SEEDS = 200
 LIMIT = 60.0
 """Seconds of processor time for each network."""
+STOPPED = 90
+"""Seconds of processor time after which it is given up, in the middle of a program."""
 SERVICE, MISSED = 0.95, 1e-4
 """Mean level demanded of each service, and how much of it a plan may miss."""
 GAP = 0.01
@@ -173,7 +181,31 @@ def planned(seed: int, family: Family = RATES) -> Outcome:
         reason = "the plan misses services"
     elif not reason and gap > GAP:
         reason = f"a gap of {gap:.2%}"
+    elif not reason and seconds() > LIMIT:
+        reason = f"{seconds():.0f} s"
     return Outcome(seed, *size, proved / scale, gap, degree, seconds(), reason)
+
+
+def planned_apart(seed: int, family: Family) -> Outcome:
+    """Plan the network of a seed in a process of its own, which may not use more than ``STOPPED`` seconds."""
+    receiver, sender = multiprocessing.Pipe(duplex=False)
+    process = multiprocessing.get_context("fork").Process(target=_planned_into, args=(sender, seed, family))
+    process.start()
+    sender.close()
+    try:
+        return receiver.recv()  # type: ignore[no-any-return]
+    except EOFError:
+        network = yearly_network(seed, family)
+        reason = f"not ended in {STOPPED} s"
+        return Outcome(seed, len(network.nodes), int(network.episode.horizon), seconds=float(STOPPED), reason=reason)
+    finally:
+        process.join()
+
+
+def _planned_into(sender: Connection, seed: int, family: Family) -> None:
+    used = int(resource.getrusage(resource.RUSAGE_SELF).ru_utime)
+    resource.setrlimit(resource.RLIMIT_CPU, (used + STOPPED, used + STOPPED))
+    sender.send(planned(seed, family))
 
 
 def yearly_network(seed: int, family: Family = RATES) -> Network:
@@ -408,20 +440,33 @@ def main(
     first: Annotated[int, typer.Option(help="First seed.")] = 0,
     jobs: Annotated[int, typer.Option(help="Networks planned side by side.")] = 1,
     family: Annotated[str, typer.Option(help=f"What they are drawn from: {', '.join(FAMILIES)}.")] = "rates",
+    kept: Annotated[
+        Path | None, typer.Option(help="File with a line for each network done; they are not run again.")
+    ] = None,
 ) -> None:
     """Plan generated networks, and tell which gaps do not close."""
     console = Console(width=None if sys.stdout.isatty() else 120)
     if (drawn_from := FAMILIES.get(family)) is None:
         raise typer.BadParameter(f"--family: {unknown_name('family', family, FAMILIES)}")
-    outcomes: list[Outcome] = []
-    with ProcessPoolExecutor(jobs) as pool, Progress(console=console) as progress:
-        task = progress.add_task("networks", total=seeds)
-        for outcome in pool.map(partial(planned, family=drawn_from), range(first, first + seeds)):
+    lines = kept.read_text().splitlines() if kept is not None and kept.exists() else []
+    outcomes = [Outcome(**json.loads(line)) for line in lines]
+    order = np.random.default_rng(seeds).permutation(np.arange(first, first + seeds)).tolist()
+    left = [seed for seed in order if seed not in {each.seed for each in outcomes}]
+    with ThreadPoolExecutor(jobs) as pool, Progress(console=console) as progress:
+        task = progress.add_task("networks", total=seeds, completed=len(outcomes))
+        for outcome in pool.map(partial(planned_apart, family=drawn_from), left):
             outcomes.append(outcome)
+            if kept is not None:
+                with kept.open("a") as file:
+                    file.write(json.dumps(asdict(outcome)) + "\n")
             closed = sum(not each.reason for each in outcomes)
             progress.update(task, advance=1, description=f"{closed} of {len(outcomes)} closed")
             if outcome.reason:
                 console.print(f"{outcome.seed}: {outcome.reason}")
+    _show(outcomes, console)
+
+
+def _show(outcomes: list[Outcome], console: Console) -> None:
     gaps, times = (np.array([getattr(each, name) for each in outcomes]) for name in ("gap", "seconds"))
     table = Table("networks", "closed", "median gap", "largest gap", "median s", "largest s")
     closed = sum(not each.reason for each in outcomes)

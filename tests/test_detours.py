@@ -157,6 +157,32 @@ def test_a_core_is_passed_as_its_nodes_are_one_by_one(seed: int, passing: int, l
     np.testing.assert_array_equal(env.advance(actions).flow[:, 1:], lone.advance(actions[:, 1:]).flow)
 
 
+@given(seed=st.integers(0, 2**31), passing=st.integers(2, 25), least=st.sampled_from([3, 99]))
+@settings(max_examples=15)
+def test_columns_of_a_copy_are_passed_as_each_alone(seed: int, passing: int, least: int) -> None:
+    """Three columns of each copy, all copies or two of them, in two calls or in rounds: to the bit."""
+    rng = np.random.default_rng(seed)
+    with crowds(least):
+        dynamics = Dynamics(cycle(seed, 2, passing))
+    low, high = dynamics.control_low[:, :1], dynamics.control_high[:, :1]
+    rate = dynamics.rate(low + (high - low) * rng.random((len(low), 4)), np.zeros(4, dtype=np.intp))
+    routing, entering = dynamics.routing, rng.random((passing, 4, 3))
+
+    def passed(copies: Any, columns: Any) -> Floats:
+        routes = routing.routes(rate)
+        assert routes is not None
+        entered = np.array(entering[:, copies, columns], order="C")  # used up
+        through = routing.throughputs(entered.reshape(passing, -1), routes.of_copies(copies))
+        return through.reshape(entered.shape)
+
+    every = passed(slice(0, 4), slice(0, 3))
+    for column in range(3):
+        alone = passed(np.array([2]), slice(column, column + 1))
+        np.testing.assert_array_equal(every[:, 2:3, column : column + 1], alone)
+    with patch("cirl_marl.dynamics.elimination.kernels_round_products", lambda: False):
+        np.testing.assert_array_equal(every[:, [3, 1]], passed(np.array([3, 1]), slice(0, 3)))
+
+
 @given(seed=st.integers(0, 2**31), count=st.integers(1, 9), exponent=st.integers(1, 14))
 def test_visits_are_accurate_however_much_goes_round(seed: int, count: int, exponent: int) -> None:
     """(I − P) V = I in fractions, where V is what several copies get together, and each alone, to the bit."""

@@ -11,6 +11,7 @@ shares are a full matrix, and its visits are found at once, by blocks.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
 from functools import cached_property
 from itertools import chain
 from typing import Annotated
@@ -266,41 +267,57 @@ class EliminatedShares:
 
     @cached_property
     def _numbers(self) -> tuple[Floats, Floats, Floats]:
-        """What one copy gives on, the inverse pivots and what comes back, in the order of ``triangles``."""
+        """What copies give on, the inverse pivots and what comes back, in the order of ``triangles``, copy by copy."""
         nodes, ahead, back = self._order.triangles
-        out = np.concatenate([part[:, 0] for _, part, _ in self._steps])
-        into = np.concatenate([part[:, 0] for _, _, part in self._steps])
-        return ahead.arrange(out), self._inverse[nodes, 0], back.arrange(into)
+        out, into = (np.concatenate([step[side] for step in self._steps]) for side in (1, 2))
+        return ahead.arrange(out), np.ascontiguousarray(self._inverse[nodes].T), back.arrange(into)
 
-    def _pass_core(self, values: Floats) -> Floats:
-        """Return what passes through the core for what enters it, shape (nodes of the core, B)."""
-        result: Floats = (np.ascontiguousarray(values.T)[:, None] @ self._visits)[:, 0].T
-        return result
+    def of_copies(self, copies: Integers | slice) -> EliminatedShares:
+        """Return the eliminated shares of some copies."""
+        part = copy(self)
+        part.__dict__.pop("_numbers", None)
+        part._steps = [(round_, out[:, copies], into[:, copies]) for round_, out, into in self._steps]
+        part._inverse = self._inverse[:, copies]
+        if len(self._order.core):
+            part._visits = self._visits[copies]
+        return part
+
+    def _pass_core(self, entering: Floats) -> Floats:
+        """Return what passes through the core for what enters it, shape (B, nodes of the core, n)."""
+        rows = np.ascontiguousarray(entering.transpose(0, 2, 1))[:, :, None]
+        through: Floats = (rows @ self._visits[:, None])[:, :, 0].transpose(0, 2, 1)
+        return through
 
     def throughput(self, inflow: Floats) -> Floats:
-        """Return q in place of what enters from elsewhere, shape (nodes, B)."""
+        """Return q in place of what enters from elsewhere, shape (nodes, B·n), with n columns for each copy."""
         # forward substitution in the order of elimination, then backward: (I − Pᵀ)⁻¹ = L⁻¹ D⁻¹ U⁻¹
-        core = self._order.core
-        if inflow.shape[1] == 1 and self._steps and kernels_round_products():
-            # of one copy each sum is that of many, but in two calls; a round takes longer to call than to compute
+        core, batch = len(self._order.core), self._inverse.shape[1]
+        by_copy: Floats = inflow.reshape(len(inflow), batch, inflow.shape[1] // batch)
+        if self._steps and kernels_round_products():
+            # in two calls; a round takes longer to call than to compute
             nodes, ahead, back = self._order.triangles
             out, inverse, into = self._numbers
-            values = inflow[nodes, 0]
+            values = np.ascontiguousarray(by_copy.take(nodes, 0).transpose(1, 0, 2))
             ahead.substitute(out, values)
-            values *= inverse
-            if len(core):
-                values[-len(core) :] = self._pass_core(values[-len(core) :, None])[:, 0]
-            values = values[::-1].copy()
+            values *= inverse[..., None]
+            if core:
+                values[:, -core:] = self._pass_core(values[:, -core:])
+            values = np.ascontiguousarray(values[:, ::-1])
             back.substitute(into, values)
-            inflow[nodes, 0] = values[::-1]
+            by_copy[nodes] = values[:, ::-1].transpose(1, 0, 2)
             return inflow
+
+        def send(total: RowSum, senders: Integers, parts: Floats) -> None:
+            total.add_to(inflow, (by_copy.take(senders, 0) * parts[..., None]).reshape(-1, inflow.shape[1]))
+
         for round_, out, _ in self._steps:
-            round_.forward.add_to(inflow, inflow.take(round_.donors, 0) * out)
-        inflow *= self._inverse
-        if len(core):
-            inflow[core] = self._pass_core(inflow[core])
+            send(round_.forward, round_.donors, out)
+        by_copy *= self._inverse[..., None]
+        if core:
+            entering = by_copy[self._order.core].transpose(1, 0, 2)
+            by_copy[self._order.core] = self._pass_core(entering).transpose(1, 0, 2)
         for round_, _, into in reversed(self._steps):
-            round_.backward.add_to(inflow, inflow.take(round_.sources, 0) * into)
+            send(round_.backward, round_.sources, into)
         return inflow
 
     def worth(self, values: Floats) -> Floats:

@@ -86,11 +86,14 @@ class Dynamics(FlowLaws):
         controls: Floats,
         step: Integers | None = None,
         factors: Floats | None = None,
+        *,
+        routes: IntervalRoutes | None = None,
         terms: int | None = None,
     ) -> Transition:
         """Hold ``controls`` for one control interval; arguments are as in ``Transition`` and ``FlowLaws.rate``.
 
-        A rough guess takes only so many ``terms`` of the exact solver's series; it conserves mass all the same.
+        Who knows the ``routes`` of the interval's shares already gives them. A rough guess takes only so many ``terms``
+        of the exact solver's series; it conserves mass all the same.
         In the physical mode scheduled flows are first cut to what their donor can deliver, so the realised flows may be
         lower than those asked for. Networks without time series and batches need no ``step``.
 
@@ -107,7 +110,7 @@ class Dynamics(FlowLaws):
         if self.slots is not None:
             stock = self.slots.shift_slots(stock)
             self.slots.set_outflows(stock, rate)
-        routes = self.routing.routes(rate)
+        routes = routes or self.routing.routes(rate)
         batch_start = None
         if self.batches.lines and step is not None:
             stock = stock.copy()

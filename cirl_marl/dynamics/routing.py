@@ -33,6 +33,12 @@ class IntervalRoutes:
     rate: Annotated[Floats, "of all arcs, which is their share of those that leave nodes without stock, (arcs, B or 1)"]
     kept_nodes: Annotated[EliminatedShares, "the kept nodes, eliminated"]
 
+    def of_copies(self, copies: Integers | slice) -> IntervalRoutes:
+        """Return the shares of some copies."""
+        if self.rate.shape[1] == 1:
+            return self
+        return IntervalRoutes(self.rate[:, copies], self.kept_nodes.of_copies(copies))
+
 
 class Routing:
     """The arcs that leave nodes without stock.
@@ -152,7 +158,7 @@ class Routing:
     def throughputs(self, through: Floats, routes: IntervalRoutes) -> Floats:
         """Return what passes through, in the rows of ``result``, for what enters, in ``places``, which is used up.
 
-        Shapes are (nodes, B).
+        Shapes are (nodes, n·B), with n columns for each copy that ``routes`` are of.
         """
         early, late = self._early, slice(self._early.stop, self.nodes)
         result = np.empty_like(through)
@@ -160,7 +166,12 @@ class Routing:
             kept_rows = result[late]
             kept_rows[...] = self._ahead.substitute(through.copy())[late]
             routes.kept_nodes.throughput(kept_rows)
-            self._on_to.add_to(through, kept_rows.take(self._on_from, 0) * routes.rate.take(self._on, 0))
+            back = kept_rows.take(self._on_from, 0)
+            shares = routes.rate.take(self._on, 0)
+            if (each := back.shape[1] // shares.shape[1]) > 1:
+                shares = shares.repeat(each, axis=1)
+            back *= shares
+            self._on_to.add_to(through, back)
         self._among.substitute(through)
         np.multiply(through[early][::-1], self._inverse, out=result[early])
         return self._back.substitute(result)

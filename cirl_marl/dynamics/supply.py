@@ -36,7 +36,7 @@ CLOSE = 3e-10
 """Distance of what is measured from what is demanded, relative to that, at which nothing lacks."""
 ROUNDS, SWEEPS, CHANGES = 12, 500, 30
 """Most corrections; and for each Gauss-Seidel sweeps, and changes of which supplies are at their bounds."""
-TERMS, SURE, GUESSES = 6, 6e-6, 4
+TERMS, SURE, GUESSES = 5, 6e-6, 4
 """Terms of the solver's series by which intervals are guessed until no more than this part of the demand lacks: what is
 left then after one more correction is little; and most corrections by guesses."""
 CELLS = 80_000
@@ -176,7 +176,7 @@ class Supply:
             return np.where(supply < most, extent, furthest)
 
         supply, base = np.zeros((2, count, batch))
-        slope, factor = np.zeros((batch, count, count)), np.ones((count, batch))
+        factor = np.ones((count, batch))
         all_controls, room = controls.copy(), None
         rate = dynamics.rate(controls, step, factors)
         routes, interval = dynamics.routing.routes(rate), dynamics.network.episode.control_interval
@@ -190,7 +190,8 @@ class Supply:
                 copies = np.flatnonzero(open_)
                 masses, insides, asked = (table.take(copies, axis=1) for table in (stock, inner, all_controls))
                 drawn = None if factors is None else factors.take(copies, axis=1)
-                part = dynamics.advance(masses, insides, asked, step[copies], drawn, terms=terms)
+                ways = routes if routes is None or len(copies) == batch else routes.of_copies(copies)
+                part = dynamics.advance(masses, insides, asked, step[copies], drawn, routes=ways, terms=terms)
                 done = part if done is None or len(copies) == batch else _with_copies(done, copies, part)
                 earlier, base[:, copies] = base.copy(), self._quantities(part)
                 shortage = demand - base
@@ -203,12 +204,16 @@ class Supply:
                 factor[factor <= 0] = 1.0  # what others supplied outweighed it
                 # where all have come to their bounds, the last that did can go back
                 has_room = (weights > 0) & ((extent < reach) | (reach >= furthest[self.of]))
-                bends = np.ones((count, batch), dtype=bool)
-                if room is not None:
-                    bends = self.total((has_room != room).astype(float)) > 0
                 per_extent = self.total(np.where(has_room, weights, 0.0))[self.of]
                 unit = np.divide(weights, per_extent, out=np.zeros_like(weights), where=has_room)
-                self.arrivals.update(slope, rate, routes, unit, bends)
+                if room is None:
+                    slope = self.arrivals(rate, routes, unit, np.arange(count)[:, None].repeat(batch, 1))
+                else:
+                    bent, where = np.nonzero(self.total((has_room != room).astype(float)))
+                    if len(bent):
+                        ways = None if routes is None else routes.of_copies(where)
+                        column = self.arrivals(rate.take(where, 1), ways, unit.take(where, 1), bent[None])
+                        slope[where, :, bent] = column[..., 0]
                 room = has_room
                 # copy by copy in memory, so that sums have the same order whatever the batch
                 per_supply = slope * np.ascontiguousarray((self.duration * factor).T)[..., None]
@@ -322,60 +327,56 @@ class Arrivals:
 
     def __init__(self, laws: FlowLaws, services: Sequence[Service], arcs: Integers, of: Integers) -> None:
         """Take the arcs, and which of ``services`` each stands for."""
-        self._laws, self._arcs, self._of, self._count = laws, arcs, of, len(services)
+        self._routing, self._of, self._count = laws.routing, of, len(services)
         network, routing = laws.staged_network, laws.routing
-        stores = len(network.stores)
-        ends = network.recipients[arcs] - stores
-        self._stockless_ends: Integers = np.flatnonzero(ends >= 0)
-        self._into: Integers = routing.places[ends[self._stockless_ends]]
+        ends = network.recipients[arcs] - len(network.stores)
+        passed_on = np.flatnonzero(ends >= 0)
+        self._into = RowSum(routing.places[ends[passed_on]], passed_on, 1.0, (routing.nodes, len(arcs)))
         into: dict[str, list[int]] = {}
         for k, arc in enumerate(network.arcs):
             into.setdefault(arc.recipient, []).append(k)
         parts, stocks = getattr(network, "parts", {}), dict[str, set[str]]()
         for node in network.stores:
             stocks.setdefault(parts.get(node.id, node.id), set()).add(node.id)
-        rows: list[int] = []
-        columns: list[int] = []
-        place = {int(k): n for n, k in enumerate([*routing.arcs, *arcs])}
+        entries: list[tuple[int, int]] = []
         for row, service in enumerate(services):
             if service.quantity == "stock":
                 stock = set[str]().union(*(stocks.get(id_, ()) for id_ in service.providers))
                 # what its parts hand on to each other is there already
-                measured_arcs = [k for id_ in stock for k in into.get(id_, ()) if network.arcs[k].donor not in stock]
+                entered = [k for id_ in stock for k in into.get(id_, ()) if network.arcs[k].donor not in stock]
             else:
-                measured_arcs = [int(k) for k in laws.staged_network.service_arcs(service)]
-            columns_ = [place[k] for k in measured_arcs if k in place]
-            rows += [row] * len(columns_)
-            columns += columns_
-        self._measure = RowSum(rows, columns, 1.0, (len(services), len(place)))
+                entered = [int(k) for k in network.service_arcs(service)]
+            entries += [(row, k) for k in entered]
+        place = {int(k): n for n, k in enumerate(routing.arcs)}
+        onward = sorted({k for _, k in entries if k in place})
+        self._onward: Integers = np.array(onward, dtype=np.intp)
+        self._senders = routing.throughput_rows[[place[k] for k in onward]]
+        columns = {k: n for n, k in enumerate([*onward, *arcs.tolist()])}
+        read = [(row, columns[k]) for row, k in entries if k in columns]
+        rows, read_columns = np.array(read, dtype=np.intp).reshape(-1, 2).T
+        self._measure = RowSum(rows, read_columns, 1.0, (len(services), len(columns)))
 
-    def update(
-        self, slope: Floats, rate: Floats, routes: IntervalRoutes | None, supply: Floats, changes: Bools
-    ) -> None:
-        """Write what each service measures more per supply to each, per time, into those columns that change.
+    def __call__(self, rate: Floats, routes: IntervalRoutes | None, supply: Floats, columns: Integers) -> Floats:
+        """Return what each service measures more per supply to n of them, per time, shape (B, services, n).
 
         Args:
-            slope: shape (B, services, services).
             rate: of all arcs in the interval, with their shares, shape (arcs, B).
             routes: by these shares.
             supply: what each of the arcs carries of a unit for its service, shape (arcs, B).
-            changes: services whose column is to be written, shape (services, B).
+            columns: which services are supplied, n for each copy, shape (n, B).
         """
-        if changes.all():
-            for s in range(self._count):
-                slope[:, :, s] = self._response(rate, routes, np.where(self._of[:, None] == s, supply, 0.0)).T
-            return
-        services, copies = np.nonzero(changes)
-        rate, supply = rate.take(copies, 1), np.where(self._of[:, None] == services, supply.take(copies, 1), 0.0)
-        slope[copies, :, services] = self._response(rate, self._laws.routing.routes(rate), supply).T
-
-    def _response(self, rate: Floats, routes: IntervalRoutes | None, supply: Floats) -> Floats:
-        """Return what services measure more for what each of the arcs supplies, shapes (services, B), (arcs, B)."""
-        routing = self._laws.routing
-        through = np.zeros((routing.nodes, rate.shape[1]))
-        np.add.at(through, self._into, supply[self._stockless_ends])
-        onward_flow = np.empty((0, rate.shape[1]))
-        if routes is not None:
-            through = routing.throughputs(through, routes).take(routing.throughput_rows, 0)
-            onward_flow = through * rate.take(routing.arcs, 0)
-        return self._measure(np.concatenate([onward_flow, supply]))
+        batch, count, nodes = supply.shape[1], len(columns), self._routing.nodes
+        slope = np.empty((batch, self._count, count))
+        block = max(1, CELLS // (1 + nodes * count))
+        for copies in (slice(first, first + block) for first in range(0, batch, block)):
+            # the columns of a copy stand beside each other
+            is_own = self._of[:, None, None] == columns.T[copies]
+            entering = np.where(is_own, supply[:, copies, None], 0.0).reshape(len(supply), -1)
+            carried = np.empty((0, *entering.shape[1:]))
+            if routes is not None:
+                through = self._routing.throughputs(self._into(entering), routes.of_copies(copies))
+                shares = rate[:, copies].take(self._onward, 0).repeat(count, axis=1)
+                carried = through.take(self._senders, 0) * shares
+            measured = self._measure(np.concatenate([carried, entering])).reshape(self._count, -1, count)
+            slope[copies] = measured.transpose(1, 0, 2)
+        return slope

@@ -72,10 +72,9 @@ class SupplyAdjoint:
         amount = inputs.controls[supply.rows]
         per_extent = np.where(idle & (amount > low) & (amount < high), supply.weights, 0.0)
         rate = dynamics.rate(inputs.controls, step, inputs.factors)
-        services, batch = len(supply.demand), rate.shape[1]
-        slope, every = np.zeros((batch, services, services)), np.ones((services, batch), dtype=bool)
-        supply.arrivals.update(slope, rate, dynamics.routing.routes(rate), per_extent, every)
-        slope *= supply.duration
+        services = len(supply.demand)
+        every = np.arange(services)[:, None].repeat(rate.shape[1], 1)
+        slope = supply.arrivals(rate, dynamics.routing.routes(rate), per_extent, every) * supply.duration
         least = TINY * dynamics.network.episode.control_interval * supply.total(per_extent)
         is_free = np.diagonal(slope, axis1=1, axis2=2) > least.T
         per_extent *= is_free.T[supply.of]

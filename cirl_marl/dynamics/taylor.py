@@ -183,11 +183,13 @@ class KronReduction:
         varying_rows, change, rest = work[self._varying_rows], work[self._change], work[self._rest]
         mean[...] = stock
         for factor in self._factors[-(terms or len(self._factors)) :]:
-            np.multiply(mean.take(self._drivers, 0), rates, out=flows)
+            mean.take(self._drivers, 0, out=flows, mode="clip")  # "raise" would copy
+            flows *= rates
             rest.fill(0.0)
             self._inflow_matrix.substitute(work)
             routes.kept_nodes.throughput(kept_rows)
-            np.multiply(kept_rows.take(self._senders, 0), shares, out=varying_rows)
+            kept_rows.take(self._senders, 0, out=varying_rows, mode="clip")
+            varying_rows *= shares
             self._spread.substitute(work)
             change *= factor
             np.add(stock, change, out=mean)

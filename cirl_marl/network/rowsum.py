@@ -14,7 +14,7 @@ from scipy import sparse
 # The kernels behind scipy's ``csc_array @ dense``. For the small matrices here the operator spends most of its time on
 # dispatch and on a fresh result; the kernels add to an array that is already there. Columns of an incidence matrix have
 # two entries each, which suits processors better than rows of random length.
-from scipy.sparse._sparsetools import csc_matvec, csc_matvecs, csr_matvec
+from scipy.sparse._sparsetools import csc_matvec, csc_matvecs, csr_matvec, csr_matvecs
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
@@ -43,32 +43,44 @@ def disposable(stock: Floats, parts: int) -> Floats:
 
 
 class Triangle:
-    """Where the entries of a strictly lower triangular matrix stand, for one copy: its numbers are given in each use.
+    """Where the entries of a strictly lower triangular matrix stand; the numbers are given in each use, for each copy.
 
-    The rows are gone through in their order, and in a row the entries as they were given.
+    The rows are gone through in their order, and in a row the entries as they were given. All copies are worked on in
+    one call, as blocks of one matrix: so many short rows that wait for each other would take longer to call for.
     """
 
     def __init__(self, rows: Integers, columns: Integers, size: int) -> None:
         """Take the places of the entries."""
         self._size, self._order = size, np.argsort(rows, kind="stable")
         self._columns = columns[self._order]
-        self._starts: Integers = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=size))])
+        self._ends: Integers = np.cumsum(np.bincount(rows, minlength=size))
+        self._blocks: dict[int, tuple[Integers, Integers]] = {}
 
     def arrange(self, numbers: Floats) -> Floats:
-        """Return the numbers of the entries, shape (entries,), as ``substitute`` takes them."""
-        return numbers.take(self._order)
+        """Return the numbers of the entries, shape (entries, B), as ``substitute`` takes them."""
+        return np.ascontiguousarray(numbers.take(self._order, 0).T)
 
     def substitute(self, numbers: Floats, values: Floats) -> None:
-        """Replace ``values``, shape (rows,), by (I − W)⁻¹ values, as ``RowSum.substitute`` does."""
-        csr_matvec(self._size, self._size, self._starts, self._columns, numbers, values, values)
+        """Replace ``values``, shape (B, rows, n), by (I − W)⁻¹ values, as ``RowSum.substitute`` does."""
+        batch, _, each = values.shape
+        if batch not in self._blocks:
+            copies = np.arange(batch, dtype=np.intp)[:, None]
+            starts = np.append(0, self._ends + copies * len(self._columns))
+            self._blocks[batch] = starts, (self._columns + copies * self._size).ravel()
+        rows, flat, entries = batch * self._size, values.reshape(-1), (*self._blocks[batch], numbers.reshape(-1))
+        if each == 1:
+            csr_matvec(rows, rows, *entries, flat, flat)
+        else:
+            csr_matvecs(rows, rows, each, *entries, flat, flat)
 
 
 @cache
 def kernels_round_products() -> bool:
     """Whether the kernels round a product before they add it, as arrays do; on some processors they do not."""
-    factor, total = np.array([1.0 + 2.0**-30]), np.array([-(1.0 + 2.0**-29)])
-    csr_matvec(1, 1, np.array([0, 1]), np.array([0]), factor, factor, total)
-    return bool(total[0] == 0.0)
+    factor, total, starts, column = np.full(2, 1.0 + 2.0**-30), np.full(4, -(1.0 + 2.0**-29)), [0, 1], [0]
+    csr_matvec(1, 1, np.array(starts), np.array(column), factor[:1], factor[:1], total[:1])
+    csr_matvecs(1, 1, 2, np.array(starts), np.array(column), factor[:1], factor, total[2:])
+    return not total[[0, 2, 3]].any()
 
 
 class RowSum:
