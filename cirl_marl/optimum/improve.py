@@ -32,6 +32,9 @@ by less than the tolerance of HiGHS."""
 PENALTY = 3.0
 """What is charged for what a service lacks, times the price that the bound puts on it. Any factor above 1 is exact at
 that price; constant controls pay more for service than the bound says."""
+CORRECTIONS = 2
+"""Most programs around an episode, after the first, that are told what the episode of the one before was away from what
+it promised: a Jacobian costs as much as many of them."""
 REFINEMENT_ROUNDS = 2
 """Most programs that are solved. Each takes about as long as the bound: the first makes up for factors that vary in the
 bound's plan, the second for what is left to first order."""
@@ -72,14 +75,18 @@ def improve_plan(
             break
         slopes = jacobians(best, dynamics) if slopes is None else slopes
         program = step_program(best, dynamics, run, demand(bound), price, trust, slopes)
-        values = best_values(program.problem, program.scale)
+        gain = 0.0
+        for _ in range(1 + CORRECTIONS):
+            values = best_values(program.problem, program.scale)
+            if values is None:  # a smaller region is another program
+                break
+            candidate = replace(best, actions=np.clip(best.actions + values[program.action], -1.0, 1.0))
+            trial = simulate_plan(candidate)
+            gain = penalised_objective(bound, trial, price) - value
+            if gain > 0:
+                break
+            program = program.corrected(values, run, trial)
         progress((done + 1) / rounds)
-        if values is None:  # a smaller region is another program
-            trust /= 4
-            continue
-        candidate = replace(best, actions=np.clip(best.actions + values[program.action], -1.0, 1.0))
-        trial = simulate_plan(candidate)
-        gain = penalised_objective(bound, trial, price) - value
         if gain > 0:
             best, run, value, trust, slopes = candidate, trial, value + gain, min(1.0, 2 * trust), None
         else:

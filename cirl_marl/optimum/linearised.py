@@ -6,7 +6,9 @@ are difference quotients of the simulator, so that cuts of flows and supplies th
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Annotated
 
 import numpy as np
 from scipy import sparse
@@ -19,7 +21,7 @@ from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.bounds import Bound
 from cirl_marl.optimum.program import LinearProgram
-from cirl_marl.optimum.window_planner import WindowSimulator, service_measures
+from cirl_marl.optimum.window_planner import WindowSimulator
 
 DIFFERENCE = 1e-6
 """Step of the difference quotients, relative to the scale of a stock or to half the range of a control."""
@@ -68,7 +70,7 @@ def jacobians(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats, Floats]
 
 @positional_record
 class StepProgram:
-    """The program of the best step: δx', δf̄, δa, levels, imbalance of each interval; then what each service lacks."""
+    """The program of the best step: δa, levels, imbalance of each interval; then what each service lacks."""
 
     problem: Annotated[LinearProgram, "the program"]
     scale: Annotated[Floats, "measure of each variable, shape (variables,)"]
@@ -76,6 +78,24 @@ class StepProgram:
     action: Annotated[Integers, "columns of δa, shape (steps, entries)"]
     level: Annotated[Integers, "columns of the levels, shape (steps, services)"]
     lack: Annotated[Integers, "columns of what services lack, shape (services,)"]
+    measured: Annotated[Integers, "interval, and row of ``measure``, of each of the first rows of G, shape (rows, 2)"]
+    measure: Annotated[Floats, "what rows read off stocks and mean flows, shape (measures, stores + arcs)"]
+
+    def corrected(self, values: Floats, run: Rollout, trial: Rollout) -> StepProgram:
+        """Return the program with what an episode was away from what its solution promised: a second-order correction.
+
+        Args:
+            values: the solution.
+            run: the episode that the program is around.
+            trial: that of the solution.
+        """
+        step, row = self.measured.T
+        before, after = (np.concatenate([each.stock, each.flow], axis=1) @ self.measure.T for each in (run, trial))
+        moves = np.zeros(len(values))
+        moves[self.action] = values[self.action]
+        limits = self.problem.under_to.copy()
+        limits[: len(row)] += (after - before)[step, row] + self.problem.under[: len(row)] @ moves
+        return replace(self, problem=replace(self.problem, under_to=limits))
 
 
 def step_program(
@@ -90,6 +110,9 @@ def step_program(
 ) -> StepProgram:
     """Return the program of the best change of the actions within a trust region, to first order.
 
+    Stocks and flows are no variables of it: to first order δ(x', f̄)_t = J_x δx'_{t−1} + J_a δa_t makes each a sum over
+    the actions so far. Rows that no step within the region can come to are left out.
+
     Args:
         bound: whose objective counts, with the actions of the episode.
         dynamics: of its network.
@@ -103,87 +126,115 @@ def step_program(
     """
     network = bound.network
     steps, entries = bound.actions.shape
-    by_stock, by_action, stocks = slopes
-    nodes, arcs, services = stocks.shape[1], len(network.arcs), len(network.services)
-    outputs = nodes + arcs
-    size = outputs + entries + services + 1
-    level, imbalance = outputs + entries, size - 1
-    # δ(x', f̄)_t − J_x δx'_{t−1} − J_a δa_t = 0, block row t of the equations
-    now, before = sparse.identity(steps), sparse.eye_array(steps, k=-1)
-    select_out, select_in = sparse.eye_array(outputs, size), sparse.eye_array(entries, size, k=outputs)
-    carry = sparse.csr_array(_diagonal(-by_stock, (outputs, nodes)))
-    carry_over = carry @ sparse.kron(before, sparse.eye_array(nodes, size))
-    effect = sparse.csr_array(_diagonal(by_action, (outputs, entries))) @ sparse.kron(now, select_in)
-    linear = sparse.kron(now, select_out) - effect
-    measure, imbalances = _measures(bound, dynamics)
-    state = np.concatenate([stocks, run.flow], axis=1)
+    stocks, services, is_absolute = slopes[2], len(network.services), network.objective.net_zero == "abs"
+    size = entries + services + 1
+    level, imbalance, count = entries, size - 1, size * steps + services
+    step_low, step_high = np.maximum(-trust, -1 - bound.actions), np.minimum(trust, 1 - bound.actions)
+    furthest = np.maximum(-step_low, step_high)
     low = np.array([network.interval_means(service.low) for service in network.services]).reshape(services, steps)
     low *= 1.0 + margin
-    # low·level − δq ≤ q, and ±(φ + δφ) ≤ imbalance, with q and φ those of the simulated episode
-    rows = np.zeros((steps, services + 2, size))
-    rows[:, :services, :outputs] = -measure
-    rows[:, np.arange(services), level + np.arange(services)] = low.T
-    rows[:, services:, :outputs], rows[:, services:, imbalance] = np.stack([imbalances, -imbalances]), -1.0
-    limits = np.concatenate([state @ measure.T, -(state @ imbalances)[:, None] * [1.0, -1.0]], axis=1)
+    measure, by_stage, imbalances = _measures(bound, dynamics)
+    weights = _circularity_cost(bound, dynamics)
+    cost = np.zeros(count)
+    state = np.concatenate([stocks, run.flow], axis=1)
+    columns = size * np.arange(steps)[:, None] + np.arange(size)
+    rows: list[sparse.csr_array] = []
+    limits: list[Floats] = []
+    measured: list[Integers] = []
+    for t, response in enumerate(_responses(*slopes[:2])):
+        past = columns[: t + 1, :entries].ravel()
+        cost[past] += weights @ response
+        # low·level − δq ≤ q; −δx ≤ x; and ±(φ + δφ) ≤ imbalance, with q, x and φ those of the simulated episode
+        table, limit, own = -by_stage @ response, by_stage @ state[t], np.zeros((len(measure), size))
+        own[np.arange(services), level + np.arange(services)] = low[:, t]
+        is_near = abs(table) @ furthest[: t + 1].ravel() > limit - own.sum(axis=1)
+        if is_absolute:
+            own[-2:, imbalance], is_near[-2:] = -1.0, True
+        near = np.flatnonzero(is_near)
+        block = sparse.csr_array(np.concatenate([table, own[:, entries:]], axis=1)[near])
+        places = np.append(past, columns[t, entries:])[block.indices]
+        rows.append(sparse.csr_array((block.data, places, block.indptr), (len(near), count)))
+        limits.append(limit[near])
+        measured.append(np.stack([np.full_like(near, t), near], axis=1))
     # mean level + lack ≥ demanded level
     means = sparse.kron(np.full((1, steps), -1.0 / steps), sparse.eye_array(services, size, k=level))
-    per_interval = _diagonal(rows, rows.shape[1:])
-    under = sparse.block_array([[per_interval, None], [means, -sparse.eye_array(services)]], format="csr")
-    bounds = np.tile(np.array([-np.inf, np.inf]), (steps, size, 1))
-    bounds[:, :nodes, 0] = -stocks
-    bounds[:, outputs:level] = np.stack(
-        [np.maximum(-trust, -1 - bound.actions), np.minimum(trust, 1 - bound.actions)], axis=2
-    )
-    bounds[:, level:imbalance] = [0.0, 1.0]
-    bounds[:, imbalance, 0] = 0.0
-    low, high = np.concatenate([bounds.reshape(-1, 2), np.tile([0.0, np.inf], (services, 1))]).T
-    problem = LinearProgram(
-        cost=np.append(np.tile(_cost(bound, size, level, nodes), steps), price),
-        equal=sparse.hstack([linear + carry_over, sparse.csr_array((steps * outputs, services))], format="csr"),
-        equal_to=np.zeros(steps * outputs),
-        under=under,
-        under_to=np.append(limits.ravel(), -demand),
-        low=low,
-        high=high,
-    )
-    # states and flows change by shares of their largest values, the others by shares of 1
-    parts = (*dynamics.staged_network.stores, *network.arcs)
-    largest = np.maximum(np.abs(state).max(axis=0), [part.scale for part in parts])
-    net = max(float(np.abs(state @ imbalances).max()), network.objective.circularity_scale)
-    sizes = np.concatenate([largest, np.ones(entries + services), [net]])
-    levels, net_flow = run.levels[0].T, np.abs(state @ imbalances)[:, None]
-    origin = np.concatenate([np.zeros((steps, level)), levels, net_flow], axis=1)
-    return StepProgram(
-        problem,
-        np.append(np.tile(sizes, steps), np.ones(services)),
-        np.append(origin, np.maximum(demand - levels.mean(axis=0), 0.0)),
-        size * np.arange(steps)[:, None] + np.arange(outputs, level),
-        size * np.arange(steps)[:, None] + np.arange(level, imbalance),
-        size * steps + np.arange(services),
-    )
-
-
-def _diagonal(blocks: Floats, shape: tuple[int, int]) -> Any:
-    return sparse.block_diag([block.reshape(shape) for block in blocks], format="csr")
-
-
-def _measures(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats]:
-    """Return what each service reads off (x', f̄), shape (services, stocks + arcs), and Δ·σ_env padded with zeros."""
-    imbalances = np.concatenate([np.zeros(dynamics.rows.nodes.stop), -bound.network.circularity_weights[1]])
-    return service_measures(bound.network, dynamics), imbalances
-
-
-def _cost(bound: Bound, size: int, level: int, nodes: int) -> Floats:
-    """Return the cost of the variables of one interval: minus the share in λ̄, or in the weighted objective."""
-    network, steps = bound.network, len(bound.actions)
-    services = len(network.services)
-    cost = np.zeros(size)
-    weights = network.circularity_weights.sum(axis=0)
-    if network.objective.net_zero == "abs":
-        weights = network.circularity_weights[0]
-        cost[-1] = 1.0 / steps
-    cost[nodes : nodes + len(weights)] = -weights / steps
+    rows.append(sparse.hstack([means, -sparse.eye_array(services)], format="csr"))
+    bounds = np.tile(np.array([0.0, np.inf]), (steps, size, 1))
+    bounds[:, :entries] = np.stack([step_low, step_high], axis=2)
+    bounds[:, level:imbalance, 1] = 1.0
+    lower, upper = np.concatenate([bounds.reshape(-1, 2), np.tile([0.0, np.inf], (services, 1))]).T
     if bound.service_weight is not None:
         cost /= network.objective.circularity_scale
-        cost[level : level + services] = -bound.service_weight / (steps * max(services, 1))
-    return cost
+        cost[columns[:, level:imbalance]] = -bound.service_weight / (steps * max(services, 1))
+    if is_absolute:
+        cost[columns[:, imbalance]] += (
+            1.0 / steps / (1.0 if bound.service_weight is None else network.objective.circularity_scale)
+        )
+    cost[size * steps :] = price
+    problem = LinearProgram(
+        cost=cost,
+        equal=sparse.csr_array((0, count)),
+        equal_to=np.empty(0),
+        under=sparse.vstack(rows, format="csr"),
+        under_to=np.concatenate([*limits, -demand]),
+        low=lower,
+        high=upper,
+    )
+    net_flow = np.abs(run.flow @ imbalances)[:, None]
+    largest = max(float(net_flow.max()), network.objective.circularity_scale)
+    origin = np.concatenate([np.zeros((steps, entries)), run.levels[0].T, net_flow], axis=1)
+    return StepProgram(
+        problem,
+        np.append(np.tile(np.append(np.ones(entries + services), largest), steps), np.ones(services)),
+        np.append(origin, np.maximum(demand - run.levels[0].mean(axis=1), 0.0)),
+        columns[:, :entries],
+        columns[:, level:imbalance],
+        size * steps + np.arange(services),
+        np.concatenate(measured),
+        measure,
+    )
+
+
+def _responses(by_stock: Floats, by_action: Floats) -> Iterator[Floats]:
+    """Give δ(x', f̄) of each interval for a unit of every action so far, shape (stocks + arcs, (t + 1)·entries)."""
+    nodes = by_stock.shape[2]
+    stock = np.empty((nodes, 0))
+    for to_stock, to_action in zip(by_stock, by_action, strict=True):
+        response = np.concatenate([to_stock @ stock, to_action], axis=1)
+        yield response
+        stock = response[:nodes]
+
+
+def _measures(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats, Floats]:
+    """Return what is read off stocks and mean flows, the same of stocks by stage, and −Δ·σ_env of flows.
+
+    Read are each service; stocks that scheduled flows leave, as no others could become negative to first order; and
+    where |φ| counts, −φ and φ. Shapes are (measures, stores + arcs), (measures, stocks + arcs) and (arcs,).
+    """
+    network, stores = bound.network, len(bound.network.stores)
+    columns = np.eye(stores + len(network.arcs))
+    services = [
+        columns[[network.node_index[node] for node in service.providers]].sum(axis=0)
+        if service.quantity == "stock"
+        else columns[stores + network.service_arcs(service)].sum(axis=0)
+        for service in network.services
+    ]
+    donors = np.unique(network.donors[dynamics.is_scheduled[: len(network.arcs)]])
+    imbalances = -network.circularity_weights[1]
+    rows = [*services, *columns[donors[donors < stores]]]
+    if network.objective.net_zero == "abs":
+        rows += [sign * np.append(np.zeros(stores), imbalances) for sign in (-1.0, 1.0)]
+    measure = np.array(rows).reshape(-1, len(columns))
+    by_stage = np.zeros((len(measure), dynamics.rows.nodes.stop + len(network.arcs)))
+    for store in range(stores):
+        by_stage[:, np.atleast_1d(dynamics.rows.stages.get(store, store))] = measure[:, [store]]
+    by_stage[:, dynamics.rows.nodes.stop :] = measure[:, stores:]
+    return measure, by_stage, imbalances
+
+
+def _circularity_cost(bound: Bound, dynamics: Dynamics) -> Floats:
+    """Return minus the share of (x', f̄) of one interval in λ̄, but for an absolute imbalance."""
+    network = bound.network
+    weights = network.circularity_weights
+    counted = weights[0] if network.objective.net_zero == "abs" else weights.sum(axis=0)
+    return np.concatenate([np.zeros(dynamics.rows.nodes.stop), -counted / len(bound.actions)])
