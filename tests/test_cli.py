@@ -301,7 +301,7 @@ def test_plan_shows_how_far_the_search_is(monkeypatch: pytest.MonkeyPatch) -> No
         yield shares.append
 
     monkeypatch.setattr("cirl_marl.cli.common.bar", bar)
-    monkeypatch.setattr("cirl_marl.optimum.mpc.search_each", partial(search_each, population=8, iterations=2))
+    monkeypatch.setattr("cirl_marl.optimum.open_loop.search_each", partial(search_each, population=8, iterations=2))
     text = (folder("envs") / "net_zero.toml").read_text(encoding="utf-8")
     Path("short.toml").write_text(text.replace("horizon = { value = 120", "horizon = { value = 24"), encoding="utf-8")
     assert run(monkeypatch, "plan", "short.toml", "--control", "optimum", "--out", "p.csv") == 0

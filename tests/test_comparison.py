@@ -107,7 +107,7 @@ def reported(run: Callable[[Callable[[str, float], None]], object]) -> list[tupl
 
 def test_plans_tell_how_far_they_are(bottles: Network, monkeypatch: pytest.MonkeyPatch) -> None:
     """A search that takes hours, programs and improvements show in the progress, and so do the bounds."""
-    monkeypatch.setattr("cirl_marl.optimum.mpc.search_each", partial(search_each, population=8, iterations=2))
+    monkeypatch.setattr("cirl_marl.optimum.open_loop.search_each", partial(search_each, population=8, iterations=2))
     short = load_network("net_zero").with_options(episode={"horizon": 16})
     told = reported(lambda progress: compare([], ["optimum"], network=short, episodes=2, progress=progress))
     begun = next(share for what, share in told if what == "optimum")

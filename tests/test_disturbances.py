@@ -45,7 +45,8 @@ from cirl_marl.network.disturbances import (
 from cirl_marl.network.elements import Lifetime
 from cirl_marl.network.processes import Paths
 from cirl_marl.network.uncertainty import CAPACITY, Spread, draw_network, expected_network
-from cirl_marl.optimum.mpc import MPC, Optimum
+from cirl_marl.optimum.mpc import MPC
+from cirl_marl.optimum.open_loop import Optimum
 
 Floats = NDArray[np.floating]
 

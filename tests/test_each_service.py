@@ -33,7 +33,8 @@ from cirl_marl.evaluation.pareto import pareto_front
 from cirl_marl.optimum import Plan, bound, envelope, improve_plan, search, simulate_plan
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.bounds import highest_service
-from cirl_marl.optimum.mpc import MPC, Optimum
+from cirl_marl.optimum.mpc import MPC
+from cirl_marl.optimum.open_loop import Optimum
 from cirl_marl.optimum.options import starting_stocks
 from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.vintages import Lifetimes

@@ -15,7 +15,7 @@ from cirl_marl.controllers.rollout import EVALUATION_SEEDS, rollout
 from cirl_marl.network.uncertainty import expected_network
 from cirl_marl.optimum import Incumbent, Plan, bound, search, search_each, standard_candidates
 from cirl_marl.optimum.cross_entropy import SHORTFALL_PRICE, Gaussians, knot_counts
-from cirl_marl.optimum.mpc import Optimum
+from cirl_marl.optimum.open_loop import Optimum
 from cirl_marl.optimum.planned_episodes import Population, starting_states
 
 EVERYWHERE = PLAYED
@@ -119,7 +119,7 @@ def test_starts_by_name() -> None:
 
 def test_optimum_control_searches_where_nothing_is_proved(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each copy of net_zero follows the plan found from its own start, and the controller says that it is no more."""
-    monkeypatch.setattr("cirl_marl.optimum.mpc.search_each", partial(search_each, population=8, iterations=2))
+    monkeypatch.setattr("cirl_marl.optimum.open_loop.search_each", partial(search_each, population=8, iterations=2))
     controller = Optimum(service_weight=1.0)
     run = rollout(MultiAgentVectorEnv("net_zero", num_envs=2, horizon=3), controller)
     assert controller.note.startswith("best plan found, no certificate: network 'net_zero'")

@@ -29,7 +29,7 @@ from cirl_marl import (
     simulate_plan,
     smooth_plan,
 )
-from cirl_marl.optimum import linearised, mpc
+from cirl_marl.optimum import linearised, open_loop
 from cirl_marl.optimum.bounds import Bound
 from cirl_marl.optimum.smooth import TOLERANCE, Distance
 
@@ -117,7 +117,7 @@ def test_orders_that_jump_calm_down() -> None:
 def test_who_asks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Large plans are made smooth only where they are asked to be, and too large ones never."""
     network, orders = store(1.0), np.zeros(0)
-    monkeypatch.setattr(mpc, "MOST_ROWS", 14)
+    monkeypatch.setattr(open_loop, "MOST_ROWS", 14)
     found = plan(network, "optimum", min_service=1.0)
     assert "has 15 rows; beyond 14 ask for it" in found.note
     orders = plan(network, "optimum", min_service=1.0, smooth=False).rollout.flow

@@ -12,7 +12,8 @@ from __future__ import annotations
 import numpy as np
 
 from cirl_marl.dynamics.adjoint import Adjoint, IntervalInputs
-from cirl_marl.dynamics.supply import TINY, Supply
+from cirl_marl.dynamics.complementarity import TINY
+from cirl_marl.dynamics.supply import Supply
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.compartment_model import Bools

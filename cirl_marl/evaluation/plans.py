@@ -16,7 +16,7 @@ from cirl_marl.errors import CirlError
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Network
 from cirl_marl.optimum.bounds import Bound, gap
-from cirl_marl.optimum.mpc import Optimum
+from cirl_marl.optimum.open_loop import Optimum
 from cirl_marl.optimum.options import levels_text
 from cirl_marl.optimum.registry import CONTROLLERS, named_controller
 

@@ -21,7 +21,7 @@ from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.bounds import Bound
 from cirl_marl.optimum.program import LinearProgram
-from cirl_marl.optimum.window_planner import WindowSimulator
+from cirl_marl.optimum.window_simulator import WindowSimulator
 
 DIFFERENCE = 1e-6
 """Step of the difference quotients, relative to the scale of a stock or to half the range of a control."""

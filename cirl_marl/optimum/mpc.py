@@ -1,4 +1,4 @@
-"""Controllers that plan with the program of the bound: again and again (MPC), or once for the episode (Optimum).
+"""Model predictive control with the program of the bound.
 
 Every ``replan`` decisions each copy solves the linear program of ``cirl_marl.optimum`` from its true current stocks,
 tries the plan in the simulator, corrects it (``window_planner``), and carries out the first planned actions. Nothing is
@@ -28,19 +28,14 @@ from numpy.typing import ArrayLike
 from cirl_marl.controllers.basic import Arrays, Planner
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, ControlError, whole_number
-from cirl_marl.network import Floats, Network
+from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.innovations import innovations
 from cirl_marl.network.uncertainty import expected_network
-from cirl_marl.optimum.admissible import Admissible, NoCertificate
-from cirl_marl.optimum.bounds import Bound, bound
-from cirl_marl.optimum.cross_entropy import KNOTS, Incumbent, search_each
+from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.draws import Prices
 from cirl_marl.optimum.futures import DrawnFutures
-from cirl_marl.optimum.improve import improve_plan
 from cirl_marl.optimum.options import check_margin, check_options, demanded_levels, starting_stocks, with_margin
-from cirl_marl.optimum.planned_episodes import Plan, starting_states
-from cirl_marl.optimum.smooth import MOST_ROWS, program_rows, smooth_plan
 from cirl_marl.optimum.solver import Infeasible, SolverFailure
 from cirl_marl.optimum.window_planner import Future, WindowPlanner
 from cirl_marl.optimum.windows import Continuation, WindowPlan, WindowTask
@@ -54,8 +49,6 @@ WINDOW = 3
 after them has its price, and nobody knows it: on paper_city and steel_japan longer windows did no better."""
 FIRST_SAMPLE, SAMPLES = 2**30, 256
 """First seed and number of the paths over which what is expected of their functions is averaged."""
-BOUND = 0.3
-"""About the share of solving for the bound in the work on a plan; the rest is to improve it."""
 
 
 @positional_record
@@ -327,93 +320,3 @@ class MPC(Planner):
         deficit = None if self._levels is None else self._levels * len(steps)
         stock = starting_stocks(future.admissible.lifetimes, None)
         return self._solve_task(self._planner, stock, steps, deficit, None, is_outlook=True)
-
-
-class Optimum(Planner):
-    """Open-loop optimal control: once started, every copy has a plan of its own for the whole episode.
-
-    Attributes:
-        plans: once started, whose plan each copy carries out: bounds, or incumbents where nothing is proved.
-        note: empty if the plans are those of bounds.
-    """
-
-    ahead = 0.99
-
-    def __init__(
-        self,
-        *,
-        min_service: ArrayLike | None = None,
-        service_weight: float | None = None,
-        smooth: bool | None = False,
-    ) -> None:
-        """Choose the objective; see ``bound``.
-
-        Args:
-            min_service: see ``bound``.
-            service_weight: likewise.
-            smooth: whether ``smooth_plan`` has the last word; None: where ``program_rows`` is at most MOST_ROWS.
-        """
-        self._min_service, self._service_weight, self._smooth = min_service, service_weight, smooth
-        self.plans: list[Bound] | list[Incumbent] = []
-        self._plan = Plan(())
-
-    def plan(self, env: MultiAgentVectorEnv, seed: int, progress: Callable[[float], None]) -> None:
-        """Solve a program for the start of every copy and improve its plan; ``seed`` has no effect.
-
-        Where no program bounds the network (``NoCertificate``), look for plans by simulation, from all starts at once.
-
-        Raises:
-            CirlError: for a service that no plan reaches, a solver that fails, or an environment in which nobody acts.
-        """
-        try:
-            network, notes = expected_network(env.network), []
-            if env.network.disturbed:
-                notes.append("plans for what disturbances are expected to be, carried out whatever they are")
-            is_small = (rows := program_rows(network)) <= MOST_ROWS
-            if self._smooth is None and not is_small:
-                notes.append(f"not made smooth: that program has {rows:,} rows; beyond {MOST_ROWS:,} ask for it")
-            smooth = is_small if self._smooth is None else self._smooth
-            self.plans, self.note = self._bound_plans(env, network, smooth, progress), "; ".join(notes)
-        except NoCertificate as reason:
-            self.plans = self._search_plans(env, progress)
-            self.note = f"best plan found, no certificate: {reason}"
-        self._plan = Plan(self.plans)
-        self._plan.start(env, seed)
-
-    def act(self, observations: Arrays) -> Arrays:
-        """Return the planned actions of the next interval."""
-        return self._plan.act(observations)
-
-    def _bound_plans(
-        self, env: MultiAgentVectorEnv, network: Network, smooth: bool, progress: Callable[[float], None]
-    ) -> list[Bound]:
-        plans: list[Bound] = []
-        by_start: dict[bytes, Bound] = {}  # copies that start alike have the same plan, though their draws differ
-        for copy, start in enumerate(env.physical.stock[env.rows.nodes].T):
-
-            def report(improvement: float, copy: int = copy) -> None:
-                progress((copy + BOUND + (1 - BOUND) * improvement) / env.num_envs)
-
-            if (key := start.tobytes()) in by_start:
-                plans.append(by_start[key])
-                report(1.0)
-                continue
-            service, weight = self._min_service, self._service_weight
-            solution = bound(network, start, min_service=service, service_weight=weight, agents=env.agents or None)
-            report(0.0)
-            plan = improve_plan(solution, progress=report)
-            plans.append(replace(smooth_plan(plan) if smooth else plan, network=env.network))
-            by_start[key] = plans[-1]
-        return plans
-
-    def _search_plans(self, env: MultiAgentVectorEnv, progress: Callable[[float], None]) -> list[Incumbent]:
-        incumbents = search_each(
-            expected_network(env.network),
-            starting_states(env),
-            min_service=self._min_service,
-            service_weight=self._service_weight,
-            agents=env.agents or None,
-            knots=min(KNOTS, env.network.episode.horizon),
-            progress=lambda share, objective: progress(share),
-        )
-        return [replace(incumbent, network=env.network) for incumbent in incumbents]

@@ -102,7 +102,8 @@ def _planner(
 ) -> Controller:
     """Return one of PLANNERS, whose solvers are loaded by those who ask for them."""
     from cirl_marl.optimum.blind import BestConstant, BestSchedule
-    from cirl_marl.optimum.mpc import MPC, SERVICE_FIRST, Optimum
+    from cirl_marl.optimum.mpc import MPC, SERVICE_FIRST
+    from cirl_marl.optimum.open_loop import Optimum
 
     demand: dict[str, Any] = {
         "min_service": min_service,

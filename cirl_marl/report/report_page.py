@@ -22,7 +22,8 @@ from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.evaluation.statistics import SHARE, Aggregate, over_episodes
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
-from cirl_marl.optimum.mpc import SERVICE_FIRST, Optimum
+from cirl_marl.optimum.mpc import SERVICE_FIRST
+from cirl_marl.optimum.open_loop import Optimum
 from cirl_marl.report.explanations import read_reasons
 from cirl_marl.report.samples import SHOWN
 from cirl_marl.report.tradeoffs import worst_notes

@@ -1,0 +1,112 @@
+"""Open-loop optimal control: a plan for the whole episode, carried out whatever happens."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from numpy.typing import ArrayLike
+
+from cirl_marl.controllers.basic import Arrays, Planner
+from cirl_marl.environments.vector import MultiAgentVectorEnv
+from cirl_marl.network import Network
+from cirl_marl.network.uncertainty import expected_network
+from cirl_marl.optimum.admissible import NoCertificate
+from cirl_marl.optimum.bounds import Bound, bound
+from cirl_marl.optimum.cross_entropy import KNOTS, Incumbent, search_each
+from cirl_marl.optimum.improve import improve_plan
+from cirl_marl.optimum.planned_episodes import Plan, starting_states
+from cirl_marl.optimum.smooth import MOST_ROWS, program_rows, smooth_plan
+
+BOUND = 0.3
+"""About the share of solving for the bound in the work on a plan; the rest is to improve it."""
+
+
+class Optimum(Planner):
+    """Open-loop optimal control: once started, every copy has a plan of its own for the whole episode.
+
+    Attributes:
+        plans: once started, whose plan each copy carries out: bounds, or incumbents where nothing is proved.
+        note: empty if the plans are those of bounds.
+    """
+
+    ahead = 0.99
+
+    def __init__(
+        self,
+        *,
+        min_service: ArrayLike | None = None,
+        service_weight: float | None = None,
+        smooth: bool | None = False,
+    ) -> None:
+        """Choose the objective; see ``bound``.
+
+        Args:
+            min_service: see ``bound``.
+            service_weight: likewise.
+            smooth: whether ``smooth_plan`` has the last word; None: where ``program_rows`` is at most MOST_ROWS.
+        """
+        self._min_service, self._service_weight, self._smooth = min_service, service_weight, smooth
+        self.plans: list[Bound] | list[Incumbent] = []
+        self._plan = Plan(())
+
+    def plan(self, env: MultiAgentVectorEnv, seed: int, progress: Callable[[float], None]) -> None:
+        """Solve a program for the start of every copy and improve its plan; ``seed`` has no effect.
+
+        Where no program bounds the network (``NoCertificate``), look for plans by simulation, from all starts at once.
+
+        Raises:
+            CirlError: for a service that no plan reaches, a solver that fails, or an environment in which nobody acts.
+        """
+        try:
+            network, notes = expected_network(env.network), []
+            if env.network.disturbed:
+                notes.append("plans for what disturbances are expected to be, carried out whatever they are")
+            is_small = (rows := program_rows(network)) <= MOST_ROWS
+            if self._smooth is None and not is_small:
+                notes.append(f"not made smooth: that program has {rows:,} rows; beyond {MOST_ROWS:,} ask for it")
+            smooth = is_small if self._smooth is None else self._smooth
+            self.plans, self.note = self._bound_plans(env, network, smooth, progress), "; ".join(notes)
+        except NoCertificate as reason:
+            self.plans = self._search_plans(env, progress)
+            self.note = f"best plan found, no certificate: {reason}"
+        self._plan = Plan(self.plans)
+        self._plan.start(env, seed)
+
+    def act(self, observations: Arrays) -> Arrays:
+        """Return the planned actions of the next interval."""
+        return self._plan.act(observations)
+
+    def _bound_plans(
+        self, env: MultiAgentVectorEnv, network: Network, smooth: bool, progress: Callable[[float], None]
+    ) -> list[Bound]:
+        plans: list[Bound] = []
+        by_start: dict[bytes, Bound] = {}  # copies that start alike have the same plan, though their draws differ
+        for copy, start in enumerate(env.physical.stock[env.rows.nodes].T):
+
+            def report(improvement: float, copy: int = copy) -> None:
+                progress((copy + BOUND + (1 - BOUND) * improvement) / env.num_envs)
+
+            if (key := start.tobytes()) in by_start:
+                plans.append(by_start[key])
+                report(1.0)
+                continue
+            service, weight = self._min_service, self._service_weight
+            solution = bound(network, start, min_service=service, service_weight=weight, agents=env.agents or None)
+            report(0.0)
+            plan = improve_plan(solution, progress=report)
+            plans.append(replace(smooth_plan(plan) if smooth else plan, network=env.network))
+            by_start[key] = plans[-1]
+        return plans
+
+    def _search_plans(self, env: MultiAgentVectorEnv, progress: Callable[[float], None]) -> list[Incumbent]:
+        incumbents = search_each(
+            expected_network(env.network),
+            starting_states(env),
+            min_service=self._min_service,
+            service_weight=self._service_weight,
+            agents=env.agents or None,
+            knots=min(KNOTS, env.network.episode.horizon),
+            progress=lambda share, objective: progress(share),
+        )
+        return [replace(incumbent, network=env.network) for incumbent in incumbents]
