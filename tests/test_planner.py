@@ -16,9 +16,12 @@ from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Ob
 from cirl_marl.controllers.basic import Neutral
 from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.definitions.catalogue import folder
+from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network import Floats
+from cirl_marl.network.elements import Lifetime
 from cirl_marl.optimum import NoCertificate, Plan, bound, improve_plan, program, search, simulate_plan, solver
+from cirl_marl.optimum.linearised import StepProgram, jacobians, step_program
 from cirl_marl.optimum.mpc import MPC
 from cirl_marl.optimum.planned_episodes import starting_states
 
@@ -76,6 +79,49 @@ def test_residence_times_of_a_fraction_of_a_step(residence: float) -> None:
     episode = simulate_plan(improve_plan(found, rounds=6))
     assert episode.episode_service[0] >= 0.97 - 1e-4
     assert 0.0 <= float(found.gap(episode.episode_circularity)[0]) < 0.01
+
+
+@pytest.mark.parametrize("lives", [False, True])
+def test_the_program_of_a_step_is_the_episode_to_first_order(lives: bool) -> None:
+    """λ̄, the levels and the reserve of a small step; and of a large one, once it was tried, what it delivers."""
+    network = yearly(0.5, horizon=5)
+    changes: dict[str, Any] = {"mine": {"initial": (4.5e5, 4.5e5)}}
+    if lives:
+        lifetime = Lifetime(mean=25.0, deviation=8.0, distribution="normal")
+        changes |= {"buildings": {"lifetime": lifetime, "growth": 0.0}, "demolition": {"law": Law.SHARE, "rate": 0.0}}
+    nodes, arcs = (
+        tuple(replace(part, **changes.get(part.id, {})) for part in parts) for parts in (network.nodes, network.arcs)
+    )
+    network = replace(network, nodes=nodes, arcs=arcs)
+    found = bound(network, min_service=0.97, degree=1)
+    found = replace(found, actions=0.5 * found.actions)
+    dynamics, run, demand = Dynamics(found.network), simulate_plan(found), np.full(2, 0.97)
+    slopes = jacobians(found, dynamics)
+
+    def after(program: StepProgram, step: Floats) -> tuple[Rollout, Floats, Floats]:
+        values = program.origin.copy()
+        values[program.action] = step
+        trial = simulate_plan(replace(found, actions=found.actions + step))
+        moved = -(program.problem.under @ np.where(np.isin(np.arange(len(values)), program.action), values, 0.0))
+        return trial, values, moved[: len(program.measured)]
+
+    rng = np.random.default_rng(1)
+    for size, accuracy in ((1e-4, 1e-3), (0.3, None)):
+        program = step_program(found, dynamics, run, demand, np.ones(2), 5.0, slopes)
+        step = size * rng.uniform(-1, 1, found.actions.shape)
+        trial, values, promised = after(program, step)
+        place, row = program.measured.T
+        read = [np.concatenate([each.stock, each.flow], axis=1) @ program.measure.T for each in (run, trial)]
+        change = (read[1] - read[0])[place, row]
+        assert set(row.tolist()) == {0, 1, 2} and len(place) > 10
+        if accuracy is not None:
+            np.testing.assert_allclose(promised, change, rtol=0, atol=accuracy * np.abs(change).max())
+            gain = float(trial.episode_circularity[0] - run.episode_circularity[0])
+            cost = program.problem.cost[program.action]
+            assert -(cost * step).sum() == pytest.approx(gain, rel=2e-3)
+        moved = program.corrected(values, run, trial).problem.under_to - program.problem.under_to
+        np.testing.assert_allclose(promised + moved[: len(place)], change, atol=1e-9 * np.abs(read[0]).max())
+        assert not moved[len(place) :].any()
 
 
 @pytest.mark.slow
