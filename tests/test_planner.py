@@ -117,7 +117,7 @@ def test_the_program_of_a_step_is_the_episode_to_first_order(lives: bool) -> Non
             gain = float(trial.episode_circularity[0] - run.episode_circularity[0])
             cost = program.problem.cost[program.action]
             assert -(cost * step).sum() == pytest.approx(gain, rel=2e-3)
-        moved = program.corrected(values, run, trial).problem.under_to - program.problem.under_to
+        moved = program.with_correction(values, run, trial).problem.under_to - program.problem.under_to
         np.testing.assert_allclose(promised + moved[: len(place)], change, atol=1e-9 * np.abs(read[0]).max())
         assert not moved[len(place) :].any()
 

@@ -282,9 +282,9 @@ class EliminatedShares:
             part._visits = self._visits[copies]
         return part
 
-    def _pass_core(self, entering: Floats) -> Floats:
+    def _pass_core(self, core_inflow: Floats) -> Floats:
         """Return what passes through the core for what enters it, shape (B, nodes of the core, n)."""
-        rows = np.ascontiguousarray(entering.transpose(0, 2, 1))[:, :, None]
+        rows = np.ascontiguousarray(core_inflow.transpose(0, 2, 1))[:, :, None]
         through: Floats = (rows @ self._visits[:, None])[:, :, 0].transpose(0, 2, 1)
         return through
 
@@ -314,8 +314,8 @@ class EliminatedShares:
             send(round_.forward, round_.donors, out)
         by_copy *= self._inverse[..., None]
         if core:
-            entering = by_copy[self._order.core].transpose(1, 0, 2)
-            by_copy[self._order.core] = self._pass_core(entering).transpose(1, 0, 2)
+            core_inflow = by_copy[self._order.core].transpose(1, 0, 2)
+            by_copy[self._order.core] = self._pass_core(core_inflow).transpose(1, 0, 2)
         for round_, _, into in reversed(self._steps):
             send(round_.backward, round_.sources, into)
         return inflow

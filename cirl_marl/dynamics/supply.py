@@ -302,12 +302,12 @@ class Arrivals:
         for copies in (slice(first, first + block) for first in range(0, batch, block)):
             # the columns of a copy stand beside each other
             is_own = self._of[:, None, None] == columns.T[copies]
-            entering = np.where(is_own, supply[:, copies, None], 0.0).reshape(len(supply), -1)
-            carried = np.empty((0, *entering.shape[1:]))
+            entry_flow = np.where(is_own, supply[:, copies, None], 0.0).reshape(len(supply), -1)
+            onward_flow = np.empty((0, *entry_flow.shape[1:]))
             if routes is not None:
-                through = self._routing.throughputs(self._into(entering), routes.of_copies(copies))
+                through = self._routing.throughputs(self._into(entry_flow), routes.of_copies(copies))
                 shares = rate[:, copies].take(self._onward, 0).repeat(count, axis=1)
-                carried = through.take(self._senders, 0) * shares
-            measured = self._measure(np.concatenate([carried, entering])).reshape(self._count, -1, count)
+                onward_flow = through.take(self._senders, 0) * shares
+            measured = self._measure(np.concatenate([onward_flow, entry_flow])).reshape(self._count, -1, count)
             slope[copies] = measured.transpose(1, 0, 2)
         return slope

@@ -85,7 +85,7 @@ def improve_plan(
             gain = penalised_objective(bound, trial, price) - value
             if gain > 0:
                 break
-            program = program.corrected(values, run, trial)
+            program = program.with_correction(values, run, trial)
         progress((done + 1) / rounds)
         if gain > 0:
             best, run, value, trust, slopes = candidate, trial, value + gain, min(1.0, 2 * trust), None

@@ -83,7 +83,7 @@ class StepProgram:
     measured: Annotated[Integers, "interval, and row of ``measure``, of each of the first rows of G, shape (rows, 2)"]
     measure: Annotated[Floats, "what rows read off stocks and mean flows, shape (measures, stores + arcs)"]
 
-    def corrected(self, values: Floats, run: Rollout, trial: Rollout) -> StepProgram:
+    def with_correction(self, values: Floats, run: Rollout, trial: Rollout) -> StepProgram:
         """Return the program with what an episode was away from what its solution promised: a second-order correction.
 
         Args:
