@@ -168,16 +168,17 @@ def test_columns_of_a_copy_are_passed_as_each_alone(seed: int, passing: int, lea
     rate = dynamics.rate(low + (high - low) * rng.random((len(low), 4)), np.zeros(4, dtype=np.intp))
     routing, entering = dynamics.routing, rng.random((passing, 4, 3))
 
-    def passed(copies: Any, columns: Any) -> Floats:
-        routes = routing.routes(rate)
+    def passed(copies: Any, columns: Any, *, anew: bool = False) -> Floats:
+        routes = routing.routes(np.ascontiguousarray(rate[:, copies]) if anew else rate)
         assert routes is not None
+        routes = routes if anew else routes.of_copies(copies)
         entered = np.array(entering[:, copies, columns], order="C")  # used up
-        through = routing.throughputs(entered.reshape(passing, -1), routes.of_copies(copies))
+        through = routing.throughputs(entered.reshape(passing, -1), routes)
         return through.reshape(entered.shape)
 
     every = passed(slice(0, 4), slice(0, 3))
     for column in range(3):
-        alone = passed(np.array([2]), slice(column, column + 1))
+        alone = passed(np.array([2]), slice(column, column + 1), anew=True)
         np.testing.assert_array_equal(every[:, 2:3, column : column + 1], alone)
     with patch("cirl_marl.dynamics.elimination.kernels_round_products", lambda: False):
         np.testing.assert_array_equal(every[:, [3, 1]], passed(np.array([3, 1]), slice(0, 3)))
