@@ -2,7 +2,8 @@
 
 python -m benchmarks.foresight [NETWORK ...]            # bounds worlds of benchmarks.uncertain, and who acts there
 python -m benchmarks.foresight paper_city --only mpc    # measures some; what is known of others stays
-python -m benchmarks.foresight --table                  # writes the table of what is kept in results/foresight.json
+python -m benchmarks.foresight paper_city --information # what it costs MPC to see disturbances late, or never
+python -m benchmarks.foresight --table                  # writes the tables of what is kept in results/foresight.json
 
 Each contender has a knob, which is set on draws of its own so that the lowest expected service is what is demanded; all
 figures are of the draws of the bound, or of the first of them. Bounds are kept in results/bounds and used again.
@@ -22,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.document import measured_table, write_sections
+from benchmarks.document import markdown_table, measured_table, write_sections
 from benchmarks.uncertain import CLOSE, DEMANDED, WORLDS, World, entries
 from benchmarks.uncertain import RESULTS as KNOBS
 from benchmarks.uncertain import contenders as simple_contenders
@@ -33,6 +34,7 @@ from cirl_marl.controllers.rollout import first_seed, rollout
 from cirl_marl.definitions.writer import fingerprint
 from cirl_marl.evaluation.calibration import calibrate
 from cirl_marl.evaluation.statistics import over_episodes, worst_mean
+from cirl_marl.network import Floats
 from cirl_marl.optimum.draw_proofs import Sampling
 from cirl_marl.optimum.draws import Prices
 from cirl_marl.optimum.mpc import MPC
@@ -52,6 +54,9 @@ PLANNERS = ("mpc", "scenario_mpc", "price_policy")
 """Contenders that solve a program for every decision, of which fewer episodes are measured."""
 LEARNERS = ("exact_gradients",)
 """Recipes of independent learners, who see what is local; prices in their training see to their service."""
+NEVER = -1
+LATE = {"at once": 0, "an interval late": 1, "four intervals late": 4, "never": NEVER}
+"""How late disturbances are seen, in intervals, by name; stocks always are."""
 BY_DRAW, PRICES = (
     ("values", "informed_values", "luck", "informed_luck", "gross_mass"),
     ("prices", "informed_prices"),
@@ -205,6 +210,39 @@ def measured(
     return figures
 
 
+def information(world: World, found: UncertainBound, margin: float, episodes: int) -> dict[str, Any]:
+    """Return the gaps of MPC with a ``margin`` that sees disturbances late, and what is lost to that at once."""
+    network, figures, gaps = found.network, dict[str, Any](), dict[str, Floats]()
+    for name, delay in LATE.items():
+        late = network.episode.horizon if delay == NEVER else delay
+        planner = MPC(min_service=DEMANDED, horizon=WINDOW, margin=margin, delay=late)
+        run = rollout(MultiAgentVectorEnv(network, num_envs=episodes), planner, seed=first_seed(found.sampling.seed))
+        gaps[name] = found.gaps(run.episode_circularity, run.episode_levels)
+        figures[name] = {
+            "gap": over_episodes(gaps[name]).as_dict(),
+            "loss": over_episodes(gaps[name] - gaps["at once"]).as_dict(),
+            "level": float(run.episode_levels.mean(axis=0).min()),
+        }
+        sys.stdout.write(f"{world.network} {name}: {json.dumps(figures[name])}\n")
+        sys.stdout.flush()
+    return {"draws": episodes, "seen": figures}
+
+
+def information_table(results: Mapping[str, Any]) -> str:
+    """Return what it costs to see late, a row for each world."""
+    rows = [
+        (
+            f"`{world.network}`",
+            _percent(entry["information"]["seen"]["at once"]["gap"]),
+            *(f"+{_percent(entry['information']['seen'][name]['loss'])}" for name in [*LATE][1:]),
+            str(entry["information"]["draws"]),
+        )
+        for world, entry in entries(results)
+        if "information" in entry
+    ]
+    return markdown_table(("world", "gap if seen at once", *[*LATE][1:], "draws"), rows)
+
+
 def table(results: Mapping[str, Any]) -> str:
     """Return what was measured as a table, and what it was made with."""
     columns = (
@@ -258,6 +296,7 @@ def main() -> None:
     parser.add_argument("networks", nargs="*", metavar="NETWORK", help="default: all six")
     parser.add_argument("--table", action="store_true", help="measure nothing")
     parser.add_argument("--only", default=",".join((*CONTENDERS, *LEARNERS)), help="contenders; default: all")
+    parser.add_argument("--information", action="store_true", help="of MPC, instead")
     parser.add_argument("--draws", type=int, default=200, help="of which the bound is the mean")
     parser.add_argument("--fit-draws", type=int, default=64, help="others, to which prices are fitted")
     parser.add_argument("--tune", type=int, default=32, help="draws on which margins of those that plan are set")
@@ -269,6 +308,12 @@ def main() -> None:
         if options.table or (options.networks and world.network not in options.networks):
             continue
         found, seconds = proof(world, Sampling(draws=options.draws, fit_draws=options.fit_draws, numbers=False))
+        if options.information:
+            results = json.loads(RESULTS.read_text())
+            margin = results[world.network]["contenders"].get("mpc", {}).get("knob", 1.0)
+            results[world.network]["information"] = information(world, found, margin, options.episodes)
+            write_json(RESULTS, results)
+            continue
         for name in options.only.split(","):
             episodes = min(options.episodes, options.draws) if name in PLANNERS else options.draws
             tune, margin = options.tune, 1.0
@@ -282,10 +327,12 @@ def main() -> None:
             if name in LEARNERS:
                 figures |= {"seeds": options.seeds, "steps": options.steps}
             results = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {}
-            rows = {**results.get(world.network, {}).get("contenders", {}), name: figures}
-            results[world.network] = {**bound_figures(found, seconds), "contenders": rows}
+            entry = results.get(world.network, {})
+            rows = {**entry.get("contenders", {}), name: figures}
+            results[world.network] = {**entry, **bound_figures(found, seconds), "contenders": rows}
             write_json(RESULTS, results)
-    write_sections(DOCUMENT, {"foresight": table(json.loads(RESULTS.read_text()))})
+    results = json.loads(RESULTS.read_text())
+    write_sections(DOCUMENT, {"foresight": table(results), "information": information_table(results)})
 
 
 if __name__ == "__main__":

@@ -22,12 +22,15 @@ from cirl_marl.evaluation import calibration
 from cirl_marl.evaluation.calibration import calibrate
 from cirl_marl.network.disturbances import DisturbanceEffect, Markov
 from cirl_marl.network.processes import DisturbanceProcesses
+from cirl_marl.network.uncertainty import expected_network
 from cirl_marl.optimum import NoCertificate, Sampling, blind, futures, simulate_plan
+from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.blind import BestConstant, BestSchedule, Replay
 from cirl_marl.optimum.futures import future_noise
 from cirl_marl.optimum.mpc import MPC
 from cirl_marl.optimum.registry import named_controller
 from cirl_marl.optimum.schedule_ascent import ScheduleAscent, improve_schedule
+from cirl_marl.optimum.window_planner import Future
 from cirl_marl.report.tradeoffs import comparison_notes
 
 Floats = NDArray[np.float64]
@@ -169,6 +172,32 @@ def test_feedback_is_between_the_blind_and_the_best() -> None:
     assert merits["scenario"] > best + 0.02 * best
     assert merits["schedule"] < merits["scenario"] - 0.02 * abs(best)
     assert merits["constant"] <= merits["schedule"] + 1e-3 * abs(best)
+
+
+def test_who_sees_late_plans_for_what_follows_from_what_it_saw() -> None:
+    """Conditional means given the states of earlier intervals; before these there is nothing to act on."""
+    network = works(6)
+    env = MultiAgentVectorEnv(network, num_envs=16)
+    first = {}
+    for delay in (0, 1, 6):
+        env.reset(seed=first_seed(0))
+        controller = MPC(min_service=0.8, delay=delay)
+        controller.start(env, 0)
+        first[delay] = env.stack(controller.act({}))
+    assert np.ptp(first[0], axis=1).max() > 0.01
+    assert np.ptp(first[1], axis=1).max() == 0.0
+    np.testing.assert_array_equal(first[1], first[6])
+    processes, states = network.processes, env.physical.processes[1]
+    future = Future(Admissible.of(expected_network(network), None), 1, None)
+    for step, delay in ((1, 0), (2, 1), (4, 3)):
+        late = futures.DrawnFutures(env, future, 1, None, None, delay)
+        expected = processes.conditional_means(states, 1, delay + 2)
+        seen = np.concatenate([processes.values(states, 1)[None], expected])[delay:]
+        np.testing.assert_allclose(late._means(range(16), step, 3), seen)
+    with pytest.raises(CirlError, match="delay 1: goes with plans for conditional means"):
+        MPC(futures=2, delay=1)
+    with pytest.raises(CirlError, match="delay must be a whole number"):
+        MPC(delay=-1)
 
 
 @pytest.mark.medium

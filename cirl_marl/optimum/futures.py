@@ -31,7 +31,13 @@ class DrawnFutures:
     """The futures of copies of an environment: conditional means, or several that are drawn."""
 
     def __init__(
-        self, env: MultiAgentVectorEnv, reference: Future, degree: int, service_weight: float | None, count: int | None
+        self,
+        env: MultiAgentVectorEnv,
+        reference: Future,
+        degree: int,
+        service_weight: float | None,
+        count: int | None,
+        delay: int = 0,
     ) -> None:
         """Prepare them.
 
@@ -41,8 +47,9 @@ class DrawnFutures:
             degree: of the test polynomials.
             service_weight: see ``Programs``.
             count: how many are drawn for each copy; None: one, of conditional means.
+            delay: intervals by which the states are late from which means are conditional.
         """
-        self._env, self._reference, self._count = env, reference, count
+        self._env, self._reference, self._count, self._delay = env, reference, count, delay
         self._degree, self._weight = degree, service_weight
         network, processes = env.network, env.network.processes
         self._prior = processes.prior_means(network.episode.horizon)
@@ -60,8 +67,7 @@ class DrawnFutures:
         processes, step, ahead = self._env.network.processes, intervals.start, len(intervals)
         states = self._env.physical.processes[step][:, list(copies)]
         if self._count is None:
-            later = processes.conditional_means(states, step, ahead - 1)
-            paths = np.concatenate([processes.values(states, step)[None], later])
+            paths = self._means(copies, step, ahead)
         else:
             noise = np.tile(future_noise(step, ahead - 1, len(states), self._count), (1, 1, len(copies)))
             paths = processes.continuations(np.repeat(states, self._count, axis=1), step, noise).values
@@ -72,6 +78,15 @@ class DrawnFutures:
         futures = [future.at(place, step) for place in range(0, len(path), ahead)]
         each = self._count or 1
         return [futures[first : first + each] for first in range(0, len(futures), each)]
+
+    def _means(self, copies: Sequence[int], step: int, ahead: int) -> Floats:
+        """Return what is expected from interval ``step`` on, given what is seen then, (ahead, names, copies)."""
+        seen, processes = step - self._delay, self._env.network.processes
+        if seen < 0:  # nothing
+            return np.repeat(self._prior[step : step + ahead, :, None], len(copies), axis=2)
+        states = self._env.physical.processes[seen][:, list(copies)]
+        later = processes.conditional_means(states, seen, step + ahead - 1 - seen)
+        return np.concatenate([processes.values(states, seen)[None], later])[self._delay :]
 
     @property
     def _network(self) -> Network:

@@ -87,6 +87,7 @@ class MPC(Planner):
         futures: int | None = None,
         margin: float = 1.0,
         prices: Prices | None = None,
+        delay: int = 0,
     ) -> None:
         """Choose what is planned.
 
@@ -104,6 +105,7 @@ class MPC(Planner):
                 charged for service that lacks.
             prices: of a bound for who does not foresee (``bound(…, uncertain=True)``): a plan then looks a single
                 interval ahead, and what stocks are worth after it follows the states of the disturbances.
+            delay: intervals by which disturbances are seen late; from the horizon on they are never seen.
 
         Raises:
             CirlError: for an option that cannot be used.
@@ -114,13 +116,15 @@ class MPC(Planner):
             raise CirlError(f"replan {replan}: of a plan for several futures only the first decision is carried out")
         if prices is not None and (horizon, futures) != (None, None):
             raise CirlError("prices are for plans of a single interval; leave out horizon and futures")
+        if whole_number("delay", delay, 0) and (prices, futures) != (None, None):
+            raise CirlError(f"delay {delay}: goes with plans for conditional means; leave out prices and futures")
         for name, value in (("replan", replan), ("horizon", horizon), ("futures", futures)):
             if value is not None:
                 whole_number(name, value, 1)
         if horizon is not None and horizon < (replan or 1):
             raise CirlError(f"horizon {horizon} is shorter than the {replan} decisions carried out of each plan")
         self._options = horizon, replan, futures
-        self._prices = prices
+        self._prices, self._delay = prices, delay
         self._margin = margin
         self._min_service, self._weight, self._degree = min_service, service_weight, degree
 
@@ -142,7 +146,7 @@ class MPC(Planner):
         expected, self._planners = self._future_as_expected(), dict[int, WindowPlanner]()
         self._planner, self._drawn = WindowPlanner([expected], self._weight), None
         if is_disturbed:
-            self._drawn = DrawnFutures(env, expected, self._degree, self._weight, futures)
+            self._drawn = DrawnFutures(env, expected, self._degree, self._weight, futures, self._delay)
         supplies = {arc.makes_up_for for arc in network.arcs if arc.makes_up_for and arc.id not in env.agents}
         self._full = np.array([service.id in supplies for service in network.services], dtype=bool)
         self._outlooks: dict[int, WindowPlan] = {}
