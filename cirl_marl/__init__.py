@@ -102,6 +102,11 @@ if TYPE_CHECKING:
     from cirl_marl.report.presentation import draw as draw
     from cirl_marl.report.presentation import summarise as summarise
     from cirl_marl.report.presentation import write_report as write_report
+    from cirl_marl.suite.result_rows import pretrained as pretrained
+    from cirl_marl.suite.row_jobs import benchmark as benchmark
+    from cirl_marl.suite.tasks import BenchmarkTask as BenchmarkTask
+    from cirl_marl.suite.tasks import load_task as load_task
+    from cirl_marl.suite.tasks import tasks as tasks
     from cirl_marl.sweeps.running import sweep as sweep
     from cirl_marl.testing.conformance import check_parallel_env as check_parallel_env
     from cirl_marl.testing.conformance import check_vector_env as check_vector_env
@@ -153,6 +158,9 @@ _MODULES = {
     "reasons.explanation": "explain",
     "reasons.inverse": "infer",
     "report.presentation": "draw summarise write_report",
+    "suite.result_rows": "pretrained",
+    "suite.row_jobs": "benchmark",
+    "suite.tasks": "BenchmarkTask load_task tasks",
     "sweeps.running": "sweep",
     "testing.conformance": "check_parallel_env check_vector_env",
     "testing.nested": "ConformanceError",

@@ -28,6 +28,7 @@ def main(environment: Path) -> None:
         run(cirl, "simulate", "carbo_net", "--control", "random", "--html", "page.html")
         run(cirl, "train", "copper_net", "--steps", "6000", "--envs", "32", "--out", "run")
         run(cirl, "evaluate", "run", "--episodes", "4")
+        run(cirl, "benchmark", "verify", "--row", "paper_city-v0/exact_gradients/401")  # with the weights of the wheel
         written = ("copper_net.png", "carbo_net_random.csv", "page.html")
         for name in (*written, "run/evaluation.json", "run/pictures/circularity.png"):
             if not (Path(folder) / name).is_file():

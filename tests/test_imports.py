@@ -23,7 +23,7 @@ LAYERS = (
     ("importing", "optimum"),
     ("learners",),
     ("evaluation", "paper"),
-    ("reasons",),
+    ("reasons", "suite"),
     ("adapters", "report", "sweeps"),
     ("__init__", "cli"),
 )

@@ -19,6 +19,7 @@ SHARE = 0.01
 SIGNATURES = {
     "DigesterPublished": "of two words: the digester as published",
     "WasteSorting": "of two words, a task of the paper and the name of its environment",
+    "pretrained": "the word of the field for policies that come with a library (torchvision, Hugging Face)",
     "Trained": "the controller of a trained run, next to ``train`` in the public interface",
 }
 """Names in signatures that look like pronouns or participles, with the reason why they stay."""

@@ -5,7 +5,17 @@ from __future__ import annotations
 import gc
 import sys
 
-from cirl_marl.cli import comparing, demonstration, episodes, explaining, importing, learning, networks, sweeping  # noqa: F401
+from cirl_marl.cli import (  # noqa: F401
+    benchmarking,
+    comparing,
+    demonstration,
+    episodes,
+    explaining,
+    importing,
+    learning,
+    networks,
+    sweeping,
+)
 from cirl_marl.cli.common import app, errors, plain
 from cirl_marl.errors import CirlError, LearnerError
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import time as clock
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
@@ -18,6 +18,7 @@ from cirl_marl.definitions.code_permission import code_allowed
 from cirl_marl.errors import CirlError
 
 if TYPE_CHECKING:
+    from cirl_marl.jobs import JobStatus
     from cirl_marl.network import Network
     from cirl_marl.report.presentation import Reportable
 
@@ -187,6 +188,14 @@ def shares() -> Iterator[Callable[[str, float], None]]:
     with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task("preparing", total=1.0)
         yield lambda activity, share: progress.update(task, description=activity, completed=share)
+
+
+def state_lines(statuses: Sequence[JobStatus], before: dict[str, str]) -> None:
+    """Say of each job that begins or ends that it does; ``before`` keeps what was said last."""
+    for status in statuses:
+        if before.setdefault(status.name, "waiting") != status.state:
+            before[status.name] = status.state
+            say(f"{status.state}: {status.name}")
 
 
 def _share_lines() -> Callable[[str, float], None]:

@@ -133,7 +133,7 @@ def _train(
             training.stackable(callbacks or {})
         for (_, directory), training in zip(runs, trainings, strict=True):
             if directory is not None:
-                run = _create(Path(directory), training.config, training.env.network)
+                run = create_run(Path(directory), training.config, training.env.network)
                 claims.enter_context(run.lock())
                 training.keep_in(run)
         run_together(trainings, callbacks=callbacks, report=report, device=device)
@@ -265,7 +265,7 @@ def _config_to_go_on(run: RunDirectory, config: RunConfig, steps: int | None) ->
     return config
 
 
-def _create(directory: Path, config: RunConfig, network: Network) -> RunDirectory:
+def create_run(directory: Path, config: RunConfig, network: Network) -> RunDirectory:
     """Start the run directory; the definition is copied if it is still what was trained on, and written if not."""
     groups = {"horizon": ("episode", network.episode), "circularity_weight": ("objective", network.objective)}
     changes = {group: {name: getattr(now, name)} for name, (group, now) in groups.items() if name in config.options}

@@ -312,11 +312,16 @@ def predict_action(
 
 def load_acting_learner(folder: Path, group: Group, env: MultiAgentVectorEnv) -> Learner:
     """Return the learner of ``group`` with the policy of a checkpoint, to act only."""
+    return acting_learner(group, env).take(folder)
+
+
+def acting_learner(group: Group, env: MultiAgentVectorEnv) -> Learner:
+    """Return the learner of ``group`` with a fresh policy, to act only."""
     parameters = {key: value for key, value in group.spec.parameters.items() if key in ACTING_PARAMETERS}
     if has_replay_buffer(group.spec.algorithm):
         parameters["buffer_size"] = 1
     spec = group.spec.model_copy(update={"parameters": parameters})
-    return Learner(AgentVecEnv(env, group.name, group.view(env)), spec, 0).build().take(folder)
+    return Learner(AgentVecEnv(env, group.name, group.view(env)), spec, 0).build()
 
 
 def wrap_in_normaliser(env: VecEnv, spec: LearnerSettings, keys: list[str] | None = None) -> VecEnv:

@@ -1,0 +1,97 @@
+"""Makes what is frozen of the benchmark: bounds of tasks and of their held-out variants, and the page about it.
+
+python -m benchmarks.suite [TASK ...]   # bounds that are missing, then their hashes in suite.toml
+python -m benchmarks.suite --table      # tables and picture of docs/benchmark.md, of the rows that are kept
+
+A world with disturbances takes the bound of benchmarks.foresight for its own episodes; its variants have fewer draws.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from pathlib import Path
+
+import tomlkit
+
+from benchmarks.document import made_with, markdown_table, write_sections
+from benchmarks.foresight import proof
+from benchmarks.uncertain import WORLDS
+from cirl_marl.optimum import Sampling, bound
+from cirl_marl.records.files import write_atomically
+from cirl_marl.report.benchmark_tables import TABLES, save_profiles
+from cirl_marl.suite.held_out import VARIANTS
+from cirl_marl.suite.result_rows import read_rows
+from cirl_marl.suite.task_bounds import TaskBound, of_draws, prove
+from cirl_marl.suite.tasks import (
+    CONTROLLERS,
+    DECLARATION,
+    HELD_OUT_EPISODES,
+    BenchmarkTask,
+    algorithms,
+    load_task,
+    tasks,
+)
+
+DRAWS, FIT_DRAWS = 200, 64
+DOCUMENT = Path(__file__).parent.parent / "docs" / "benchmark.md"
+SECTIONS = {
+    "gaps": "gap to the bound",
+    "scores": "scores over all tasks",
+    "improvement": "probability of improvement",
+    "transfer": "transfer",
+}
+"""Marks of the document, and tables by their titles."""
+
+
+def proved(task: BenchmarkTask) -> TaskBound:
+    """Return the bound of a task or variant."""
+    network = task.network()
+    if not network.disturbed:
+        return prove(network, task.episodes, task.seed, task.min_service)
+    if task.variant:
+        sampling = Sampling(draws=task.episodes, fit_draws=HELD_OUT_EPISODES, seed=task.seed, numbers=False)
+        return of_draws(bound(network, min_service=task.min_service, degree=1, uncertain=sampling))
+    world = next(world for world in WORLDS if (world.network, world.scenario) == (network.name, network.scenario_name))
+    return of_draws(proof(world, Sampling(draws=DRAWS, fit_draws=FIT_DRAWS, numbers=False))[0])
+
+
+def write_page() -> None:
+    """Write the tables and the picture of the document, of the rows that are kept."""
+    rows = read_rows()
+    names = (*CONTROLLERS, *algorithms())
+    counts = {name: sum(row.algorithm == name and not row.variant for row in rows) for name in names}
+    present = ", ".join(f"`{name}` {count}" for name, count in counts.items() if count)
+    missing = ", ".join(f"`{name}`" for name, count in counts.items() if not count)
+    wanted = len(tasks()) * len(load_task(tasks()[0]).seeds)
+    coverage = f"Rows so far, of {len(tasks())} of each controller and {wanted} of each learner: {present}."
+    coverage += f" None yet: {missing}." if missing else ""
+    sections = {"coverage": f"{coverage} {made_with()}"}
+    for name, title in SECTIONS.items():
+        headings, body = TABLES[title](rows)
+        sections[name] = markdown_table(headings, body) if body else "No rows yet."
+    write_sections(DOCUMENT, sections)
+    save_profiles(DOCUMENT.parent / "pictures" / "benchmark.png", rows)
+
+
+def main() -> None:
+    """Compute what is missing, and write hashes."""
+    if sys.argv[1:] == ["--table"]:
+        return write_page()
+    bases = [load_task(name) for name in sys.argv[1:] or tasks()]
+    for task in (*bases, *(base.held_out(variant) for base in bases for variant in VARIANTS)):
+        if not task.bound_path.is_file():
+            proved(task).write(task.bound_path)
+            sys.stdout.write(f"{task.bound_path}\n")
+            sys.stdout.flush()
+    document = tomlkit.parse(DECLARATION.read_text())
+    for base in bases:
+        paths = [base.bound_path, *(base.held_out(variant).bound_path for variant in VARIANTS)]
+        hashes = [hashlib.sha256(path.read_bytes()).hexdigest() for path in paths if path.is_file()]
+        document["tasks"][base.name]["sha256"] = hashes
+    text = tomlkit.dumps(document)
+    write_atomically(DECLARATION, lambda path: path.write_text(text))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,330 @@
+"""The frozen benchmark: its tasks, bounds and scores; rows, their weights, and how they are checked."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from command import run
+from some import some
+
+import cirl_marl
+from cirl_marl import CirlError, Neutral, RunError, Trained, load_task, tasks
+from cirl_marl.controllers.rollout import rollout
+from cirl_marl.definitions.ids import ids
+from cirl_marl.learners.acting_weights import acting_weights, rebuild_run
+from cirl_marl.optimum.certificate import Certificate
+from cirl_marl.report.benchmark_tables import aggregate_cells, gap_cells, held_out_cells, save_profiles
+from cirl_marl.suite import row_jobs, task_bounds
+from cirl_marl.suite import tasks as declared
+from cirl_marl.suite.held_out import SPREAD
+from cirl_marl.suite.result_rows import ResultRow, add_rows, key_of, last_digit, read_rows, verify
+from cirl_marl.suite.tasks import PACKAGE_DATA, algorithms, load_algorithm
+from cirl_marl.suite.weights import LARGEST_FILE, read_weights, write_weights
+
+ALL_WEIGHTS = 4_000_000
+"""Bytes of all weights that come with the package, at most."""
+ALL_BOUNDS = 2_000_000
+TASKS_SHA256 = "043452fb642435114f235f6ed998b815173aa50ea2db76d7b068912ebfff2f41"
+"""Of all that suite.toml declares of version 1: who changes it makes version 2."""
+TASK = "paper_city-v0"
+"""A task with three agents, of which an episode takes milliseconds."""
+
+
+def test_the_declaration_is_frozen() -> None:
+    """Tasks, budgets, seeds, demands, bounds and learners of version 1 stay as they are."""
+    document = declared._declaration()
+    digest = hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
+    assert digest == TASKS_SHA256, "suite.toml has changed: rows of version 1 no longer mean what they did"
+
+
+def test_there_are_enough_tasks() -> None:
+    """At least eight of several agents, three of which are disturbed, with ids that exist; ten learners, ten seeds."""
+    suite = [load_task(name) for name in tasks()]
+    networks = [task.network() for task in suite]
+    assert len(suite) >= 8
+    assert all(len(network.agents) >= 2 for network in networks)
+    assert sum(bool(network.disturbed) for network in networks) >= 3
+    assert all(task.id in ids().values() for task in suite)
+    assert len(algorithms()) == len(suite[0].seeds) == 10
+    for name in algorithms():
+        recipe = load_algorithm(name).recipe_of()
+        recipe.check(10_000)
+        assert recipe.run.min_service == suite[0].min_service
+
+
+@pytest.mark.parametrize("name", tasks())
+def test_resets_and_rollouts_are_those_of_the_version(name: str) -> None:
+    """Neutral control reaches what its row says to the last digit, against the bound of this version."""
+    assert verify(ids=[f"{name}/neutral"]) == [f"{name}/neutral"], "other numbers need another version of the task"
+    task = load_task(name)
+    assert task.sha256
+    for variant in (task, *map(task.held_out, task.variants)):
+        bound = variant.bound()
+        assert len(bound.values) == variant.episodes
+        assert (bound.prices >= 0).all()
+        assert bound.scale > 0
+
+
+def test_certificates_prove_the_bounds() -> None:
+    """Computed anew from the multipliers, without a solver, in every episode; draws have none of their own."""
+    task = load_task(TASK)
+    network, kept = task.network(), task.bound()
+    assert kept.recompute(network, task.seed) == pytest.approx(kept.values, rel=1e-9)
+    fresh = task_bounds.prove(network, 3, task.seed, task.min_service)
+    assert fresh.values == pytest.approx(kept.values[:3], rel=1e-3)
+    assert fresh.prices[0] > 0
+    world = load_task("paper_city.breakdowns-v0")
+    with pytest.raises(RunError, match="each draw of its bound has multipliers"):
+        world.bound().recompute(world.network(), world.seed)
+    # the price is the slope of what the same multipliers prove of another demand
+    certificate = Certificate(equal=fresh.equal, under=fresh.under)
+    starts, less = task_bounds.starts_of(network, 1, task.seed), fresh.demand - [0.01, 0.0]
+    looser = task_bounds._values_at(network, starts, certificate, less)
+    assert looser[0] - fresh.values[0] == pytest.approx(0.01 * fresh.prices[0], rel=1e-6)
+
+
+def test_who_does_nothing_has_no_score() -> None:
+    """Nothing moved and nobody served is almost no gap, but service counts; a gap counts from 0 to 1."""
+    task = load_task("copper_net-v0")
+    gap = float(task.bound().gaps(np.zeros(task.episodes), np.zeros((task.episodes, 1))).mean())
+    assert gap < 0.05
+    assert task.score(gap, 0.0) == task.score(0.0, task.min_service - 2 * task.tolerance) == 0.0
+    assert task.score(0.25, task.min_service - 0.5 * task.tolerance) == 0.75
+    assert task.score(7.0, 1.0) == 0.0
+    assert task.score(-0.1, 1.0) == 1.0
+
+
+def test_held_out_variants_have_other_numbers() -> None:
+    """Rates, demands and starts differ within the stated range, always alike; agents and arcs are the same."""
+    task = load_task("copper_net-v0")
+    network, variant, other = task.network(), task.held_out(1).network(), task.held_out(2).network()
+    rates = np.array([(a.rate, b.rate) for a, b in zip(network.arcs, variant.arcs, strict=True) if a.rate], float)
+    bands = np.array([(a.low, b.low) for a, b in zip(network.services, variant.services, strict=True)], float)
+    factors = [after / before for before, after in (*rates, *bands)]
+    factors += (variant.initial[network.initial > 0] / network.initial[network.initial > 0]).tolist()
+    assert len(set(factors)) > 5
+    assert np.abs(np.array(factors) - 1).max() <= SPREAD * (1 + 1e-9)
+    assert variant == task.held_out(1).network() != other
+    assert variant.agents == network.agents
+    with pytest.raises(CirlError, match="held-out variants are"):
+        task.held_out(4)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a benchmark with a learner's row, of a training of some seconds, and neutral control's."""
+    folder, patch = tmp_path_factory.mktemp("suite"), pytest.MonkeyPatch()
+    patch.setattr(declared.SuiteAlgorithm, "steps", lambda algorithm, task: 2 * 32 * 160)
+    patch.setattr(row_jobs, "shutil", SimpleNamespace(rmtree=lambda run: run.rename(folder / "original")))
+    outcome = cirl_marl.benchmark(
+        [TASK], algorithms=["neutral", "ppo"], seeds=[401], out=folder, contributor="me", held_out=True
+    )
+    patch.undo()
+    assert not outcome.failures
+    return folder
+
+
+def test_a_row_is_made_once(trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What has a row is neither trained nor evaluated again; the trained policies have rows on all variants."""
+    rows = read_rows(trained / "results.csv")
+    assert [key_of(row) for row in rows] == [
+        (f"{TASK}/{who}", variant) for who in ("neutral", "ppo/401") for variant in range(4)
+    ]
+    assert {row.contributor for row in rows} == {"me"}
+    assert {row.steps for row in rows} == {0, 2 * 32 * 160}
+    monkeypatch.setattr(row_jobs.ResultJob, "run", lambda job, tell: pytest.fail("a row was made again"))
+    again = cirl_marl.benchmark([TASK], algorithms=["neutral", "ppo"], seeds=[401], out=trained, held_out=True)
+    assert list(again.rows) == rows
+    assert not list((trained / "runs").iterdir())
+
+
+def test_weights_act_as_the_run_did(trained: Path, tmp_path: Path) -> None:
+    """A run that is rebuilt from what acts gives the same actions to the bit, and is a run like any other."""
+    policies = cirl_marl.pretrained(f"{TASK}/ppo/401", tmp_path / "run", results=trained / "results.csv")
+    arrays, description = acting_weights(policies.run)
+    kept, words = read_weights(trained / "weights" / TASK / "ppo-401.safetensors")
+    assert {key: array.tolist() for key, array in kept.items()} == {key: a.tolist() for key, a in arrays.items()}
+    assert words == description
+    assert not [key for key in arrays if "value_net" in key]
+    task = load_task(TASK)
+    twin = Trained(rebuild_run(tmp_path / "twin", arrays, description, task.network()))
+    env = task.env(2, **{**policies.run.config.options})
+    first, *rest = (rollout(env, team, seed=5) for team in (Trained(trained / "original"), policies, twin))
+    assert all((first.controls == again.controls).all() for again in rest)
+    comparison = cirl_marl.compare([policies.run], ["neutral"], episodes=2, bounds=False)
+    assert {row.name for row in comparison.rows} == {"ppo", "neutral"}
+    del arrays[next(iter(arrays))]
+    with pytest.raises(RunError, match="do not fit the learners"):
+        rebuild_run(tmp_path / "lacking", arrays, description, task.network())
+
+
+def changed(trained: Path, folder: Path, **cells: str) -> Path:
+    """Return a copy of the table in which the learner's row has other cells."""
+    with (trained / "results.csv").open() as file:
+        header, *lines = list(csv.reader(file))
+    row = next(line for line in lines if line[2] == "ppo")
+    for name, text in cells.items():
+        row[header.index(name)] = text
+    for path in (trained / "weights").rglob("*.safetensors"):
+        copy = folder / path.relative_to(trained)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy.write_bytes(path.read_bytes())
+    (folder / "results.csv").write_text("\n".join(map(",".join, [header, row])) + "\n")
+    return folder / "results.csv"
+
+
+def altered(text: str) -> str:
+    """Return a number whose last digit differs by 2 or more; by 1 both may be right where a digit is about to turn."""
+    return text[:-1] + str((int(text[-1]) + 2) % 10)
+
+
+@pytest.mark.parametrize("column", ["circularity", "service", "gap_high"])
+def test_a_changed_digit_is_found(trained: Path, tmp_path: Path, column: str) -> None:
+    """A rerun of the policy gives every digit of its row, and no other."""
+    (row,) = (row for row in read_rows(trained / "results.csv") if row.algorithm == "ppo" and not row.variant)
+    assert verify(trained / "results.csv", [row.id]) == [row.id]
+    stated = next(csv.DictReader(changed(trained, tmp_path).read_text().splitlines()))[column]
+    table = changed(trained, tmp_path, **{column: altered(stated)})
+    with pytest.raises(RunError, match=f"row '{row.id}': {column} is {altered(stated)}, a rerun gives {stated}"):
+        verify(table)
+
+
+BAD: dict[str, tuple[dict[str, str], str]] = {
+    "weights elsewhere": (
+        {"weights": "weights/none.safetensors"},
+        r"row '.*/ppo/401': its weights are missing: .*none",
+    ),
+    "no weights": ({"weights": ""}, "names no weights"),
+    "another hash": ({"sha256": "0" * 64}, r"has another SHA-256, \w+, than the row, 0000"),
+    "unknown task": ({"task": "paper_cty-v0"}, r"row 2: unknown task .*Did you mean 'paper_city-v0'"),
+    "no number": ({"gap": "small"}, "row 2: gap 'small' is no number"),
+    "infinite": ({"gap": "inf"}, "row 2: gap is inf"),
+    "no variant": ({"variant": "9"}, "held-out variants are"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_rows_are_named(trained: Path, tmp_path: Path, case: str) -> None:
+    """File, row and value stand in the message."""
+    cells, message = BAD[case]
+    table = changed(trained, tmp_path, **cells)
+    with pytest.raises(CirlError, match=message):
+        verify(table)
+
+
+def test_bad_tables_and_files_are_named(trained: Path, tmp_path: Path) -> None:
+    """A table that is none, a row that is there twice, weights that are none or too large, unknown ids."""
+    table = changed(trained, tmp_path)
+    weights = tmp_path / "weights" / TASK / "ppo-401.safetensors"
+    weights.write_bytes(b"nothing")
+    (row,) = read_rows(table)
+    with pytest.raises(RunError, match="is not the file of row"):
+        cirl_marl.pretrained(row.id, results=table)
+    add_rows(table, [replace(row, sha256=hashlib.sha256(b"nothing").hexdigest())])
+    with pytest.raises(RunError, match="is no file of weights"):
+        verify(table)
+    with pytest.raises(CirlError, match=f"unknown policy .*Did you mean '{row.id}'"):
+        cirl_marl.pretrained(f"{TASK}/ppo/402", results=table)
+    with pytest.raises(CirlError, match="unknown row"):
+        verify(table, [f"{TASK}/ppo/402"])
+    table.write_text(table.read_text() + table.read_text().splitlines()[1] + "\n")
+    with pytest.raises(RunError, match=r"row 3: 'paper_city-v0/ppo/401', variant 0, is there already"):
+        read_rows(table)
+    table.write_text("a,b\n1,2\n")
+    with pytest.raises(RunError, match="has the columns a, b"):
+        read_rows(table)
+    with pytest.raises(RunError, match="no such table"):
+        read_rows(tmp_path / "none.csv")
+    with pytest.raises(RunError, match="take smaller policies"):
+        write_weights(tmp_path / "large.safetensors", {"a": np.zeros(LARGEST_FILE)}, {})
+    with pytest.raises(CirlError, match=r"unknown algorithm 'pppo'. Did you mean 'ppo'"):
+        cirl_marl.benchmark([TASK], algorithms=["pppo"], out=tmp_path)
+    with pytest.raises(CirlError, match="unknown task"):
+        load_task("copper_nt-v0")
+    assert last_digit("0.00310") == pytest.approx(1e-5)
+
+
+def test_what_is_kept_is_whole_and_small() -> None:
+    """Every kept row has the weights that it names and no file is nobody's; all of it is small."""
+    rows = read_rows()
+    files = {
+        path.relative_to(PACKAGE_DATA).as_posix(): path
+        for path in (PACKAGE_DATA / "weights").rglob("*")
+        if path.is_file()
+    }
+    assert set(files) == {row.weights for row in some(rows) if row.weights}
+    assert {row.algorithm for row in rows if not row.weights} == {"neutral"}
+    for row in rows:
+        if row.weights:
+            assert hashlib.sha256(files[row.weights].read_bytes()).hexdigest() == row.sha256
+    assert max(path.stat().st_size for path in files.values()) <= LARGEST_FILE
+    assert sum(path.stat().st_size for path in files.values()) <= ALL_WEIGHTS
+    assert sum(path.stat().st_size for path in (PACKAGE_DATA / "bounds").iterdir()) <= ALL_BOUNDS
+    for algorithm in ("neutral", "best_constant"):
+        assert {row.task for row in rows if row.algorithm == algorithm} == set(tasks())
+    bounds = {task.bound_path.name for name in tasks() for task in [load_task(name)]}
+    bounds |= {task.held_out(k).bound_path.name for task in map(load_task, tasks()) for k in task.variants}
+    assert {path.name for path in (PACKAGE_DATA / "bounds").iterdir()} == bounds
+
+
+def test_pretrained_policies_come_with_the_package() -> None:
+    """A kept policy acts in its task as its row says, and no learner is far below the bound unnoticed."""
+    (id_,) = verify(ids=[f"{TASK}/exact_gradients/401"])
+    policies = cirl_marl.pretrained(id_)
+    assert isinstance(policies, Trained)
+    assert policies.run.config.network == "paper_city"
+    assert load_task(TASK).measure(policies, episodes=4).gap.value < 0.02
+
+
+def made_up(task: str, algorithm: str, seed: int | None, gap: float, **more: float) -> ResultRow:
+    """Return a row with a gap."""
+    figures = {"circularity": -1.0, "service": 1.0, "gap_low": gap, "gap_high": gap} | more
+    return ResultRow(task=task, algorithm=algorithm, seed=seed, episodes=4, gap=gap, **figures)  # type: ignore[arg-type]
+
+
+def test_tables_say_what_rows_do(tmp_path: Path) -> None:
+    """Gaps by task, missed services marked; figures over all tasks of those alone that have rows on all of them."""
+    rows = [made_up(name, "ppo", seed, 0.25 * (seed - 400)) for name in tasks() for seed in (401, 402)]
+    rows += [made_up(TASK, "a2c", 401, 0.5), made_up(TASK, "mpc", None, 0.1, service=0.5)]
+    headings, body = gap_cells(rows)
+    assert headings == ["task", "mpc", "ppo", "a2c"]
+    assert dict(zip(headings, body[tasks().index(TASK)], strict=True)) == {
+        "task": f"`{TASK}`", "mpc": "10.0% (missed)", "ppo": "37.5%", "a2c": "50.0%",
+    }  # fmt: skip
+    (row,) = aggregate_cells(rows)[1]
+    assert row[:2] == ["ppo", "2"]
+    assert row[4].startswith("0.625")
+    transferred = [replace(row, variant=1, gap=row.gap + 0.1) for row in rows if row.algorithm == "ppo"]
+    assert held_out_cells([*rows, *transferred])[1] == [["ppo", "20", "0.625", "0.525", "100%"]]
+    assert save_profiles(tmp_path / "profiles.png", rows).stat().st_size > 10_000
+
+
+def test_commands(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The command line makes rows, shows them, and verifies them."""
+    table, mine = str(trained / "results.csv"), str(tmp_path / "mine")
+    assert run(monkeypatch, "benchmark", "verify", table, "--held-out") == 0
+    assert f"as stated: {TASK}/ppo/401" in capsys.readouterr().out
+    assert run(monkeypatch, "benchmark", "table", table) == 0
+    assert "gap to the bound" in capsys.readouterr().out
+    assert run(monkeypatch, "benchmark", "table", table, "--out", str(tmp_path / "profiles.png")) == 2
+    assert "nobody has rows on every task" in capsys.readouterr().err
+    assert run(monkeypatch, "benchmark", "run", TASK, "--algorithm", "neutral", "--out", mine, "--on", "here") == 0
+    assert f"{TASK}/neutral: λ̄" in capsys.readouterr().out
+    assert run(monkeypatch, "benchmark", "run", TASK, "--seeds", "one") == 2
+    assert "must be whole numbers" in capsys.readouterr().err
+
+
+def test_measure_takes_policies_of_ones_own() -> None:
+    """Whatever ``rollout`` takes can be held against the bound of a task."""
+    figures = load_task(TASK).measure(Neutral(), episodes=3)
+    assert figures.gap.value > 0
+    assert 0 < figures.service.value <= 1
