@@ -277,7 +277,7 @@ def _rows(results: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
                 f"{level:.4f}{'' if abs(level - DEMANDED) <= CLOSE else ' (missed)'}",
                 _mass(figures["circularity"]["value"]),
                 _mass(figures["worst_circularity"]["value"]),
-                f"{figures['milliseconds']:.2g}" if figures["milliseconds"] >= NOTICEABLE else "",
+                f"{figures['milliseconds']:.0f}" if figures["milliseconds"] >= NOTICEABLE else "",
                 f"{figures['draws']}",
             )
 
