@@ -5,8 +5,8 @@ python -m benchmarks.learning --recipe independent_ars --first 900 --networks 5
 python -m benchmarks.learning --table                   # writes the table of what is kept in results/learning.json
 
 Networks are those of ``benchmarks.yearly`` with three to forty agents and one to three services, without lifetimes and
-with them; every other two of them have days in place of years, with four decisions a day. Left out are those whose
-episode takes more than so many terms of the solver's series, as they would train for hours.
+with them; every other two of them have days in place of years, with four decisions a day. Left out are those of which a
+decision takes more than so many terms of the solver's series, as they would train for hours.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ DOCUMENT = Path(__file__).parent.parent / "docs" / "study.md"
 RESULTS = Path(__file__).parent / "results" / "learning.json"
 RECIPE, FIRST_SEED, NETWORKS = "exact_gradients", 700, 10
 """No tuning looked at networks of the first seed or later ones."""
-TERMS = 4_000
-"""Most terms of the solver's series in an episode."""
+TERMS = 25
+"""Most terms of the solver's series in a decision."""
 AGENTS, SERVICES = range(3, 41), range(1, 4)
 PLAIN = Family(years=(10, 40), regions=(1, 4), products=(1, 3))
 LIVES = Family(
@@ -60,7 +60,7 @@ def fitting(first: int) -> Iterator[tuple[int, Network]]:
         network = network_of(seed)
         if len(network.default_agents) in AGENTS and len(network.services) in SERVICES:
             dynamics = Dynamics(network)
-            if dynamics.terms * dynamics.substeps * network.episode.horizon <= TERMS:
+            if dynamics.terms * dynamics.substeps <= TERMS:
                 yield seed, network
 
 

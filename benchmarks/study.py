@@ -65,7 +65,7 @@ class Case:
     options: dict[str, Any] = field(default_factory=dict)
 
 
-RECIPES = ("independent_ars", "independent_ppo", "shared_ppo", "mappo", "joint_ppo")
+RECIPES = ("exact_gradients", "independent_ars", "independent_ppo", "shared_ppo", "mappo", "joint_ppo")
 CASES = {
     "copper_net": Case(RECIPES),
     "carbo_net": Case(RECIPES),
