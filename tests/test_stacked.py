@@ -20,13 +20,17 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from cirl_marl import CirlError, MultiAgentVectorEnv, RecipeError
+from cirl_marl.learners import trainer
 from cirl_marl.learners.interface import Trained, export, resume, train, train_seeds
 from cirl_marl.learners.learner import derived_seed
 from cirl_marl.learners.lockstep import Streams
-from cirl_marl.learners.recipe import LearnerSettings, Match, Normalisation, Recipe, Run
+from cirl_marl.learners.policies import Policies
+from cirl_marl.learners.recipe import LearnerSettings, Match, Normalisation, Recipe, Run, load_recipe
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.learners.stacked.perceptrons import ACTIVATIONS, Layer, Perceptrons
+from cirl_marl.learners.stacked.stack import StackedPolicies
 from cirl_marl.learners.trainer import Training
+from cirl_marl.learners.validation import Score, validation_score
 
 PPO_SMALL = {"n_steps": 10, "batch_size": 10, "n_epochs": 2, "policy_kwargs": {"net_arch": [8, 8]}}
 AGENTS = ["mine", "use", "sorting"]
@@ -353,3 +357,29 @@ def test_stacked_runs_are_reproducible_and_act(tmp_path: Path) -> None:
         for key, value in each.model.policy.state_dict().items():
             assert torch.equal(value, other.learners[name].model.policy.state_dict()[key])
     assert Trained(tmp_path / "a").checkpoint.name.endswith("complete")
+
+
+@pytest.mark.parametrize("name", ["independent_ars", "mappo", "independent_ppo"])
+def test_evaluations_act_by_stacks_as_by_policies(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """The same but for rounding, each training's own learners, in other numbers of copies, with central critics too."""
+    seen: list[tuple[Score, Score]] = []
+
+    def watch(env: MultiAgentVectorEnv, policies: StackedPolicies) -> Score:
+        members = [member for stack, part in policies._parts for member in stack.members[part]]
+        alone = Policies({member.name: member.policy for member in members})
+        assert not policies.policies and len(members) == len({member.name for member in members})
+        seen.append((validation_score(env, policies), validation_score(env, alone)))
+        return seen[-1][0]
+
+    monkeypatch.setattr(trainer, "validation_score", watch)
+    given = load_recipe(name)
+    short = {"evaluations": 2, "episodes": 3, "envs": 64 if name == "independent_ars" else 2}
+    given = given.model_copy(update={"run": given.run.model_copy(update=short)})
+    if "n_steps" in given.learner.parameters:
+        given.learner.parameters.update(n_steps=10, batch_size=20)
+    train_seeds("copper_net", given, seeds=[1, 2], steps=short["envs"] * 20, horizon=5)
+    assert len(seen) == 4 or len(seen) == 6
+    for stacked, alone in seen:
+        assert stacked.circularity == pytest.approx(alone.circularity, rel=1e-5)
+        assert stacked.service == pytest.approx(alone.service, rel=1e-5)
+    assert len({stacked.circularity for stacked, _ in seen}) > 2
