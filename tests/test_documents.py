@@ -280,14 +280,14 @@ def test_readme_results_are_those_of_the_study() -> None:
 def test_readme_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The ten lines of Python run as printed, but for a shorter training."""
     (code,) = blocks((ROOT / "README.md").read_text(), "python")
-    assert "steps=4_000_000" in code
-    recipe = load_recipe("independent_ars")
+    assert 'directory="runs/mine", seed=0' in code
+    recipe = load_recipe("exact_gradients")
     short = recipe.model_copy(update={"run": recipe.run.model_copy(update={"evaluations": 1, "episodes": 8})})
     monkeypatch.setattr("cirl_marl.learners.interface.load_recipe", lambda name: short)
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
-    exec(compile(code.replace("4_000_000", "20_480"), "README.md", "exec"), names)
-    assert "ARS" in type(names["training"].learners["mine"].model).__name__  # type: ignore[attr-defined]
+    exec(compile(code.replace('runs/mine", seed=0', 'runs/mine", steps=5_120, seed=0'), "README.md", "exec"), names)
+    assert "PPO" in type(names["training"].learners["mine"].model).__name__  # type: ignore[attr-defined]
     assert (tmp_path / "runs" / "mine" / "status.json").is_file()
 
 
