@@ -81,11 +81,11 @@ print(f"{cirl_marl.gap(best.objective, plan.episode_circularity[0]):.2%} from th
 # %% [markdown]
 # ## Let agents learn it
 #
-# Each of the two agents gets a learner of its own: random search over a small policy, by the recipe `independent_ars`.
-# They know nothing of the network but what they observe.
+# Each of the two agents gets a small policy of its own, which climbs derivatives of the simulator: the recipe
+# `exact_gradients`. It acts by what its agent observes, and by nothing else.
 
 # %%
-cirl_marl.train(network, directory="runs/bottles", steps=800_000, seed=0)
+cirl_marl.train(network, directory="runs/bottles", steps=400_000, seed=0)
 evaluation = cirl_marl.evaluate("runs/bottles", episodes=16, seed=1)
 print(evaluation)
 
