@@ -238,7 +238,8 @@ def _cells(row: Row, neutral: Floats, network: str) -> Iterator[str]:
     if mine:
         config = mine[0].config
         learner = config.recipe.learner
-        yield from (learner.algorithm, learner.scheme, config.options.get("reward", "mixed"), f"{config.steps:,}")
+        algorithm = "exact gradients" if config.recipe.run.engine == "gradients" else learner.algorithm
+        yield from (algorithm, learner.scheme, config.options.get("reward", "mixed"), f"{config.steps:,}")
     else:
         yield from ("", "", "", "")
     yield _figure(row.figure("circularity"), "{:.4g}")
