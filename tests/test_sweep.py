@@ -30,6 +30,7 @@ from cirl_marl.learners.interface import train
 from cirl_marl.network import Network
 from cirl_marl.sweeps import Cell, CellStatus, load_sweep, sweep
 from cirl_marl.sweeps.cells import cells_of
+from cirl_marl.sweeps.reading import SweepFile
 
 RECIPE = """
 name = "{name}"
@@ -403,3 +404,13 @@ def test_kills_change_nothing(asked: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert min(kills.values()) >= 2 and saved, (kills, saved)
     assert outcome(Path("killed")) == outcome(Path("whole"))
+
+
+def test_without_recipes_each_network_has_its_default() -> None:
+    """Exact gradients where there are derivatives, else random search; what is named counts for all."""
+    file = SweepFile(networks=["copper_net", "net_zero"], seeds=[0, 1])
+    found = [(cell.network, cell.recipe.name, cell.seed) for cell in cells_of(file)]
+    recipes = {"copper_net": "exact_gradients", "net_zero": "independent_ars"}
+    assert found == [(network, recipes[network], seed) for seed in (0, 1) for network in recipes]
+    named = SweepFile(networks=["copper_net", "net_zero"], recipes=["mappo", "shared_ppo"])
+    assert [cell.recipe.name for cell in cells_of(named)] == ["mappo", "shared_ppo"] * 2
