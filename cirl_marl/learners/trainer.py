@@ -193,7 +193,8 @@ class Training:
                 reason = gradient_obstacle(learner, next(iter(self.learners.values())).spec)
             if engine in ("stacked", "gradients") and reason is not None:
                 place = f"recipe '{self.config.recipe.name}': {title}: engine {engine}"
-                raise RecipeError(f"{place}: {reason}; use engine auto or lockstep")
+                other = ", or another recipe, such as independent_ars" if engine == "gradients" else ""
+                raise RecipeError(f"{place}: {reason}; use engine auto or lockstep{other}")
             if reason is None and engine == "lockstep":
                 reason = "engine lockstep"
             elif reason is None and learner.name in callbacks:
