@@ -194,8 +194,9 @@ def test_every_module_is_described() -> None:
 
 def test_documents_tell_of_what_they_name() -> None:
     """A page leads to the section that names it in its heading, or first names it or its file."""
-    (solids,) = sections_about("solids_net")
-    assert solids.startswith("[networks.md](../docs/networks.md#solids_net")
+    made, learnt = sections_about("solids_net")
+    assert made.startswith("[networks.md](../docs/networks.md#solids_net")
+    assert learnt.startswith("[compartments.md](../docs/compartments.md#robots-solids_net")
     assert sections_about("copper_world") == ["[data.md](../docs/data.md#copper-aluminium-and-plastics)"]
     assert sections_about("steel_spain", "steel.toml") == ["[data.md](../docs/data.md#data-of-the-real-cycles)"]
     assert sections_about("nothing_of_the_kind") == []
