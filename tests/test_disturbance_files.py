@@ -130,6 +130,14 @@ def test_both_ends_of_a_band_may_move_together() -> None:
             "observed_by: unknown agent 'stor'. Did you mean 'store'",
         ),
         ({"walk": replace(KINDS["walk"], start=2.0)}, r"walk: start 2 must lie in \[0.7, 1.3\]"),
+        ({"walk": replace(KINDS["walk"], high=np.inf)}, "walk: high inf must be finite"),
+        ({"price": replace(KINDS["price"], low=-np.inf)}, "price: low -inf must be finite"),
+        ({"outage": replace(KINDS["outage"], values=(1.0, np.inf, 0.4))}, "outage: values: value 2, inf, must be fin"),
+        ({"season": replace(KINDS["season"], profile=(np.nan, 1.0))}, "season: profile: value 1, nan, must be finite"),
+        ({"record": replace(KINDS["record"], values=(1.0, 0.9, -np.inf))}, "record: values: value 3, -inf, must be"),
+        ({"outage": Markov(values=(), lengths=())}, "outage: values: a chain has at least two regimes, got 0"),
+        ({"season": replace(KINDS["season"], profile=())}, "season: profile: needs at least one value"),
+        ({"record": replace(KINDS["record"], values=())}, "record: values: a record has at least two values, got 0"),
     ],
 )
 def test_mistakes_of_disturbances_are_named(changes: dict[str, Disturbance], message: str) -> None:

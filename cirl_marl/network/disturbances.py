@@ -423,7 +423,7 @@ def disturbance_problems(network: Specification) -> Iterator[str]:
     disturbances: Mapping[str, Disturbance] = network.disturbances
     compartments = [part.id for part in (*network.nodes, *network.arcs)]
     for name, disturbance in disturbances.items():
-        mistakes = list(bound_problems(disturbance)) or list(disturbance.problems())
+        mistakes = [*bound_problems(disturbance), *_infinite_values(disturbance)] or list(disturbance.problems())
         mistakes += _sight_problems(disturbance)
         mistakes += (
             f"observed_by: {unknown_name('agent', id_, compartments)}"
@@ -436,6 +436,13 @@ def disturbance_problems(network: Specification) -> Iterator[str]:
             yield f"{path}: disturbed_by: {unknown_name('disturbance', disturbed.by, disturbances)}"
     if network.correlation is not None:
         yield from (f"disturbance_correlation: {fault}" for fault in network.correlation.problems(disturbances))
+
+
+def _infinite_values(disturbance: Disturbance) -> Iterator[str]:
+    """Yield the listed values that are not finite."""
+    for key in ("values", "profile"):
+        listed = getattr(disturbance, key, ())
+        yield from (f"{key}: value {i}, {x:g}, must be finite" for i, x in enumerate(listed, 1) if not math.isfinite(x))
 
 
 def _sight_problems(disturbance: Disturbance) -> Iterator[str]:
