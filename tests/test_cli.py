@@ -200,7 +200,7 @@ def test_demo_trains_compares_and_opens_its_report(
     assert len(opened) == 1 and "open it in a browser" in capsys.readouterr().out
     monkeypatch.setattr(demonstration, "NETWORK", "copper_net")
     assert run(monkeypatch, "demo") == 2
-    assert "is a run of independent_ars in bottles, not of the demo" in " ".join(capsys.readouterr().err.split())
+    assert "is a run of exact_gradients in bottles, not of the demo" in " ".join(capsys.readouterr().err.split())
 
 
 def test_demo_stopped_says_what_is_kept(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

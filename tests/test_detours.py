@@ -9,7 +9,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -17,6 +17,7 @@ from benchmarks.generated import market_network, yearly_network
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, MultiAgentVectorEnv, Network, Node, Role, Series
 from cirl_marl.dynamics.elimination import visits
 from cirl_marl.dynamics.integrator import Dynamics
+from cirl_marl.errors import NetworkError
 from cirl_marl.dynamics.static_elimination import SparseRow, StaticElimination, contract_hubs, square_matrix
 from cirl_marl.network import RowSum
 
@@ -104,7 +105,10 @@ def test_explicit_solvers_take_the_same_detours(seed: int) -> None:
 def test_throughputs_past_detours_are_accurate(seed: int, passing: int, exponent: int) -> None:
     """Against fractions, of the very shares that the simulator has, however small the leak and whoever is kept."""
     rng = np.random.default_rng(seed)
-    network = cycle(seed, 2, passing, leak=10.0**-exponent)
+    try:
+        network = cycle(seed, 2, passing, leak=10.0**-exponent)
+    except NetworkError:  # rounding can leave a loop without a leak, which is refused
+        reject()
     with keeping(np.flatnonzero(rng.random(passing) < 0.3).tolist()):
         dynamics = Dynamics(network)
     low, high = dynamics.control_low[:, :1], dynamics.control_high[:, :1]

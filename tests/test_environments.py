@@ -191,9 +191,9 @@ def test_difference_rewards_stay_within_their_memory(monkeypatch: pytest.MonkeyP
     widths: list[int] = []
     advance = Dynamics.advance
 
-    def noted(self: Dynamics, stock: Any, *rest: Any) -> Any:
+    def noted(self: Dynamics, stock: Any, *rest: Any, **options: Any) -> Any:
         widths.append(stock.shape[1])
-        return advance(self, stock, *rest)
+        return advance(self, stock, *rest, **options)
 
     monkeypatch.setattr(Dynamics, "advance", noted)
     monkeypatch.setattr(credit, "CELLS", 2000)

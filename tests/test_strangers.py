@@ -60,7 +60,7 @@ def test_no_source_opens_what_can_run_code() -> None:
         f"{path.name}:{number}: {line.strip()}"
         for path in some(sorted(SOURCES.rglob("*.py")))
         for number, line in enumerate(path.read_text().splitlines(), 1)
-        if OPENERS.search(line.split("#")[0]) and '"""' not in line
+        if OPENERS.search(line.split("#")[0]) and '"""' not in line and "allow_pickle=False" not in line
     ]
     sent = [line for line in said if line.startswith(("slurm.py", "worker.py"))]
     assert [line.partition(": ")[2] for line in sent] == [
