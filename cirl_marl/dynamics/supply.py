@@ -124,7 +124,6 @@ class Supply:
         step: Integers,
         idle: Bools,
         factors: Floats | None = None,
-        terms: int | None = None,
     ) -> tuple[Floats, Transition]:
         """Hold controls for an interval in which ``idle`` arcs make up for services.
 
@@ -135,20 +134,19 @@ class Supply:
             step: index of the interval in each copy, shape (B,).
             idle: which arcs nobody acts on in each copy, shape (arcs, B or 1).
             factors: on the uncertain numbers, as ``Dynamics.advance`` takes them.
-            terms: of the solver's series, likewise.
 
         Returns:
             the controls with what the arcs supply, and what the interval did.
         """
         if not idle.any():
-            return controls, self._dynamics.advance(stock, inner, controls, step, factors, terms=terms)
+            return controls, self._dynamics.advance(stock, inner, controls, step, factors)
         batch, idle = controls.shape[1], np.broadcast_to(idle, (len(self.arcs), controls.shape[1]))
         block = max(1, CELLS // self._dynamics.rows.masses)
         parts = []
         for columns in (slice(first, first + block) for first in range(0, batch, block)):
             masses, states, others = (np.ascontiguousarray(array[:, columns]) for array in (stock, inner, controls))
             draws = None if factors is None else np.ascontiguousarray(factors[:, columns])
-            parts.append(self._advance_block(masses, states, others, step[columns], idle[:, columns], draws, terms))
+            parts.append(self._advance_block(masses, states, others, step[columns], idle[:, columns], draws))
         if len(parts) == 1:
             return parts[0]
         arrays = zip(*([getattr(done, field.name) for field in fields(done)] for _, done in parts), strict=True)
@@ -156,14 +154,7 @@ class Supply:
         return np.concatenate([part for part, _ in parts], axis=1), Transition(*joint)
 
     def _advance_block(
-        self,
-        stock: Floats,
-        inner: Floats,
-        controls: Floats,
-        step: Integers,
-        idle: Bools,
-        factors: Floats | None,
-        all_terms: int | None,
+        self, stock: Floats, inner: Floats, controls: Floats, step: Integers, idle: Bools, factors: Floats | None
     ) -> tuple[Floats, Transition]:
         """Do what ``advance`` does, for copies so few that all they take stays in a cache."""
         dynamics, batch, count = self._dynamics, controls.shape[1], len(self.demand)
@@ -189,7 +180,7 @@ class Supply:
         rate = dynamics.rate(controls, step, factors)
         routes, interval = dynamics.routing.routes(rate), dynamics.network.episode.control_interval
         done: Transition | None = None
-        for terms, accuracy, rounds in ((TERMS, SURE, GUESSES), (all_terms, CLOSE, ROUNDS)):
+        for terms, accuracy, rounds in ((TERMS, SURE, GUESSES), (None, CLOSE, ROUNDS)):
             open_, expected = np.ones(batch, dtype=bool), np.zeros((count, batch))
             for correction in range(rounds + 1):
                 extent = extents(supply)[self.of]

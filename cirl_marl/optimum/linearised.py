@@ -25,9 +25,6 @@ from cirl_marl.optimum.window_simulator import WindowSimulator
 
 DIFFERENCE = 1e-6
 """Step of the difference quotients, relative to the scale of a stock or to half the range of a control."""
-TERMS = 9
-"""Terms of the solver's series by which difference quotients are taken. The mean of a stock that turns over once in a
-substep is then right to 2⁹/10!, 1e-4, all slower ones to far less: enough for the direction of a step."""
 MOST_SLOPES = 50_000_000
 """Entries of the largest Jacobians of all intervals that are written, 0.4 GB."""
 
@@ -62,8 +59,9 @@ def jacobians(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats, Floats]
     interval = np.repeat(np.arange(steps), nodes + entries + 1)
     inner = np.empty((0, flat.shape[1]))
     stocks, supply = dynamics.extend(flat[:nodes]), Supply(dynamics)
-    controls, idle = actuators.controls(flat[nodes:], interval), supply.idle(actuators.agents)
-    _, done = supply.advance(stocks, inner, controls, interval, idle, terms=min(TERMS, dynamics.terms) or None)
+    _, done = supply.advance(
+        stocks, inner, actuators.controls(flat[nodes:], interval), interval, supply.idle(actuators.agents)
+    )
     outputs = np.concatenate([done.stock[rows.nodes], done.moved_mass / network.episode.control_interval])
     by_interval = outputs.reshape(len(outputs), steps, -1).transpose(1, 0, 2)
     slopes = (by_interval[:, :, :-1] - by_interval[:, :, -1:]) / shift[:, None]
