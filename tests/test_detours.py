@@ -17,8 +17,8 @@ from benchmarks.generated import market_network, yearly_network
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, MultiAgentVectorEnv, Network, Node, Role, Series
 from cirl_marl.dynamics.elimination import visits
 from cirl_marl.dynamics.integrator import Dynamics
-from cirl_marl.errors import NetworkError
 from cirl_marl.dynamics.static_elimination import SparseRow, StaticElimination, contract_hubs, square_matrix
+from cirl_marl.errors import NetworkError
 from cirl_marl.network import RowSum
 
 Floats = NDArray[np.float64]

@@ -89,10 +89,8 @@ def test_the_program_of_a_step_is_the_episode_to_first_order(lives: bool) -> Non
     if lives:
         lifetime = Lifetime(mean=25.0, deviation=8.0, distribution="normal")
         changes |= {"buildings": {"lifetime": lifetime, "growth": 0.0}, "demolition": {"law": Law.SHARE, "rate": 0.0}}
-    nodes, arcs = (
-        tuple(replace(part, **changes.get(part.id, {})) for part in parts) for parts in (network.nodes, network.arcs)
-    )
-    network = replace(network, nodes=nodes, arcs=arcs)
+    nodes = tuple(replace(node, **changes.get(node.id, {})) for node in network.nodes)
+    network = replace(network, nodes=nodes, arcs=tuple(replace(arc, **changes.get(arc.id, {})) for arc in network.arcs))
     found = bound(network, min_service=0.97, degree=1)
     found = replace(found, actions=0.5 * found.actions)
     dynamics, run, demand = Dynamics(found.network), simulate_plan(found), np.full(2, 0.97)

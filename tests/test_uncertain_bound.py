@@ -41,7 +41,7 @@ from cirl_marl.network.disturbances import BlockBootstrap, DisturbanceEffect, Ga
 from cirl_marl.network.elements import Lifetime
 from cirl_marl.network.innovations import innovations
 from cirl_marl.network.uncertainty import Spread, draw_network, expected_network
-from cirl_marl.optimum import NoCertificate, draws, price_fit, solver, uncertain_bound
+from cirl_marl.optimum import NoCertificate, draws, price_fit, uncertain_bound
 from cirl_marl.optimum.draw_proofs import Sampling
 from cirl_marl.optimum.draws import Draw, DrawProgram, DrawProof, Prices
 from cirl_marl.optimum.mpc import MPC
@@ -227,35 +227,6 @@ def test_fitted_prices_close_what_foresight_is_worth() -> None:
     )
     assert informed - best > 0.05 * abs(best)
     assert best - 1e-8 <= fitted <= informed - 0.5 * (informed - best)
-
-
-def test_other_prices_go_on_from_the_last_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
-    """To what is found from nothing; HiGHS gets a program of a draw once, and another one if its boxes change."""
-    network, runs = works(3), list[str]()
-    program = Paths.of(network).programs[2]
-    monkeypatch.setattr(solver._ScaledProgram, "run", watched(solver._ScaledProgram.run, "told", runs))
-    monkeypatch.setattr(solver._ScaledProgram, "run_on", watched(solver._ScaledProgram.run_on, "on", runs))
-    for seed in range(4):
-        problem = program.with_prices(prices_of(network, seed, 0.05, DEMAND, 2.0))
-        proof = program.prove(problem)
-        fresh = DrawProgram(program.draw, None, 1).prove(problem)
-        assert proof.value == pytest.approx(fresh.value, abs=1e-8)
-    assert runs == ["told", "told", *["on", "told"] * 3]
-    narrow = replace(problem, high=0.9 * problem.high)
-    assert program.prove(narrow).value == pytest.approx(
-        DrawProgram(program.draw, None, 1).prove(narrow).value, abs=1e-8
-    )
-    assert runs[-2:] == ["told", "told"]
-
-
-def watched(method: Callable[..., Any], name: str, calls: list[str]) -> Callable[..., Any]:
-    """Return a method that writes down that it was called."""
-
-    def call(*arguments: Any, **options: Any) -> Any:
-        calls.append(name)
-        return method(*arguments, **options)
-
-    return call
 
 
 @pytest.mark.medium

@@ -15,7 +15,7 @@ from cirl_marl.network.innovations import innovations
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.certificate import Certificate, verify
 from cirl_marl.optimum.program import Program, Programs
-from cirl_marl.optimum.solver import LARGE_PROGRAM, Basis, Infeasible, SolverFailure, WarmStart, solve
+from cirl_marl.optimum.solver import Basis, Infeasible, SolverFailure, solve
 from cirl_marl.optimum.stock_values import stock_values
 
 MEMORIES = (0.7, 0.95)
@@ -141,7 +141,7 @@ class DrawProgram:
         self.draw, self._totals = draw, admissible.lifetimes.totals
         self._programs = Programs(admissible, degree, service_weight, constant_shares=False)
         self.problem = self._programs.program(draw.initial)
-        self.layout, self._warm = self.problem.layout, WarmStart()
+        self.layout = self.problem.layout
 
     def with_prices(self, prices: Prices) -> Program:
         """Return the program under ``prices``."""
@@ -168,9 +168,8 @@ class DrawProgram:
         """
         if basis is not None and (len(basis.columns), len(basis.rows)) != self._size:
             basis = None
-        warm = self._warm if len(problem.cost) < LARGE_PROGRAM else None
         try:
-            solution = solve(problem, basis, label="the program of a draw", same_rows=basis is not None, warm=warm)
+            solution = solve(problem, basis, label="the program of a draw", same_rows=basis is not None)
         except (SolverFailure, Infeasible):
             certificates = [self.no_multipliers, *(item for item in substitutes if self._fits(item))]
             proofs = [verify(problem, certificate, np.zeros(len(problem.cost))).bound for certificate in certificates]

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from copy import copy
 from importlib.util import find_spec
 from typing import Annotated
 
@@ -26,7 +25,6 @@ WARM_ITERATIONS = 2000
 """Simplex iterations from a given basis after which interior points, which need none, are the faster way."""
 PRIMAL, DEVEX = 4, 1
 """HiGHS's numbers of the primal simplex method, and of the weights of edges by Devex (Forrest and Goldfarb 1992)."""
-BASIC = int(highspy.HighsBasisStatus.kBasic)
 NO_PLAN = (highspy.HighsModelStatus.kInfeasible, highspy.HighsModelStatus.kUnboundedOrInfeasible)
 """As every variable is bounded, the latter means the former."""
 HighsOptions = Mapping[str, str | float]
@@ -93,15 +91,6 @@ class Solution:
     basis: Annotated[Basis | None, "from which a similar program may start; None if it was found without"]
 
 
-class WarmStart:
-    """HiGHS at the optimum of a program, from which it goes on under other costs without being told all anew."""
-
-    def __init__(self) -> None:
-        """Begin without one."""
-        self.program: _ScaledProgram | None = None
-        self.highs: highspy.Highs | None = None
-
-
 def solve(
     problem: Program,
     basis: Basis | None = None,
@@ -111,7 +100,6 @@ def solve(
     same_rows: bool = False,
     is_near: bool = False,
     is_rough: bool = False,
-    warm: WarmStart | None = None,
 ) -> Solution:
     """Minimise cᵀv over the program.
 
@@ -129,7 +117,6 @@ def solve(
         is_rough: whether an answer to half a percent is enough for a large program.
         certify: whether multipliers must prove the answer good; else what HiGHS calls optimal is taken at its word,
             and of other answers that satisfy the rows the best.
-        warm: what programs before left, of which this one may differ in the cost alone; then ``basis`` is not needed.
 
     Raises:
         Infeasible: if there is no solution.
@@ -142,18 +129,10 @@ def solve(
     if is_large:
         rough = (ROUGH_SETTINGS,) if is_rough else ()
         attempts = (*rough, *LARGE_SETTINGS) if find_spec(EXTRA) else LARGE_SETTINGS[1:]
-    warm = warm or WarmStart()
-    if warm.program is None or not warm.program.has_rows_of(problem):
-        warm.highs = None
-        warm.program = _ScaledProgram(problem, np.maximum(np.abs(problem.low), np.abs(problem.high)))
-    program, last = warm.program.with_cost(problem.cost), warm.highs
-    for settings in (None, *attempts) if basis is not None or last is not None else attempts:
-        if settings is None and last is not None:
-            highs = program.run_on(last)
-        else:
-            highs = program.run(settings, basis if settings is None else None, primal=same_rows, is_near=is_near)
+    program = _ScaledProgram(problem, np.maximum(np.abs(problem.low), np.abs(problem.high)))
+    for settings in (None, *attempts) if basis is not None else attempts:
+        highs = program.run(settings, basis if settings is None else None, primal=same_rows, is_near=is_near)
         model_status = highs.getModelStatus()
-        warm.highs = highs if model_status == highspy.HighsModelStatus.kOptimal and highs.getBasis().valid else None
         status, is_refused = highs.modelStatusToString(model_status), model_status in NO_PLAN
         if is_refused and settings is not None and not certify:
             break
@@ -206,35 +185,11 @@ class _ScaledProgram:
         largest = abs(rows).max(axis=1).toarray().ravel()
         self._row = 1.0 / np.where(largest > 0, largest, 1.0)
         self._rows = sparse.csr_array(sparse.diags_array(self._row) @ rows)
-        self._set_cost(problem.cost)
-        self._equal = len(problem.equal_to)
-        self._to = np.concatenate([problem.equal_to, problem.under_to]) * self._row
-
-    def _set_cost(self, cost: Floats) -> None:
-        cost = cost * self._size
+        cost = problem.cost * self._size
         self._scale = float(np.abs(cost).max(initial=0.0)) or 1.0
         self._cost = cost / self._scale
-
-    def has_rows_of(self, problem: LinearProgram) -> bool:
-        """Whether a program is this one, but for its cost."""
-        parts = ("equal", "equal_to", "under", "under_to", "low", "high")
-        return all(getattr(problem, part) is getattr(self.problem, part) for part in parts)
-
-    def with_cost(self, cost: Floats) -> _ScaledProgram:
-        """Return the program with other costs."""
-        other = copy(self)
-        other._set_cost(cost)
-        return other
-
-    def run_on(self, highs: highspy.Highs) -> highspy.Highs:
-        """Return HiGHS, at the optimum under other costs, after a run of the primal simplex method from there."""
-        before = highs.getInfo().simplex_iteration_count
-        highs.changeColsCost(len(self._cost), np.arange(len(self._cost), dtype=np.int32), self._cost)
-        highs.setOptionValue("solver", "simplex")
-        highs.setOptionValue("simplex_strategy", PRIMAL)
-        highs.setOptionValue("simplex_iteration_limit", max(before, 0) + WARM_ITERATIONS)
-        highs.run()
-        return highs
+        self._equal = len(problem.equal_to)
+        self._to = np.concatenate([problem.equal_to, problem.under_to]) * self._row
 
     def run(
         self, settings: HighsOptions | None, basis: Basis | None, *, primal: bool = False, is_near: bool = False
@@ -249,9 +204,7 @@ class _ScaledProgram:
             first = highspy.HighsBasis()
             first.col_status = [highspy.HighsBasisStatus(status) for status in basis.columns.tolist()]
             first.row_status = [highspy.HighsBasisStatus(status) for status in basis.rows.tolist()]
-            # one of another size is completed, for which HiGHS factorises it once more
-            first.alien = int(np.sum(basis.columns == BASIC) + np.sum(basis.rows == BASIC)) != len(self._to)
-            first.valid = True
+            first.alien = first.valid = True
             highs.setBasis(first)
             if primal:
                 highs.setOptionValue("simplex_strategy", PRIMAL)

@@ -13,7 +13,7 @@ def stock_values(programs: Programs, problem: Program, certificate: Certificate,
     """Return how much the objective rises for a unit of mass more in a stock, new at the start of intervals.
 
     Of a node with a lifetime it is new as well: it leaves as what has just entered does. What more of a stock changes
-    in boxes and in the envelopes of products is left out.
+    in boxes, in the envelopes of products and in what orders deliver at least is left out.
 
     Args:
         programs: what the program was made by, or made alike.
