@@ -386,6 +386,30 @@ def test_multipliers_of_one_start_bound_another(network: Network, seed: int, wei
     assert (together.at(starts) <= solved + slack).all()  # each start was solved
 
 
+def test_multipliers_bound_starts_from_which_orders_are_cut() -> None:
+    """A program has the same rows, whether a store can run short or never does; and those of one start prove others."""
+
+    def flow(low: float, high: float) -> Control:
+        return Control(kind=ControlKind.FLOW, low=low, neutral=low, high=high)
+
+    arcs = [
+        Arc(id="sell", donor="store", recipient="tip", law=Law.CONTROLLED, control=flow(8.0, 9.0)),
+        Arc(id="make", donor="mine", recipient="store", law=Law.CONTROLLED, control=flow(0.0, 4.0)),
+    ]
+    nodes = (
+        Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR, initial=(900.0, 900.0)),
+        Node(id="store", initial=(5.0, 300.0)),
+        Node(id="tip", role=Role.LANDFILL, initial=(0.0, 0.0)),
+    )
+    network = Network(name="shop", nodes=nodes, arcs=tuple(arcs), episode=Episode(control_interval=1.0, horizon=4))
+    starts = np.array([[900.0, 5.0, 0.0], [900.0, 20.0, 0.0], [900.0, 300.0, 0.0]])
+    solved = np.array([bound(network, start).objective for start in starts])
+    assert np.ptp(solved) > 1.0
+    for start in starts:
+        proved = bound(network, start).at(starts)
+        assert (proved >= solved - 1e-6).all()
+
+
 def test_multipliers_of_one_level_bound_another() -> None:
     """A bound for one demanded service proves one for each other: an affine function of the level, never too small."""
     found = bound("carbo_net", min_service=0.9, horizon=12, degree=1)

@@ -256,17 +256,19 @@ def idle_supplies(admissible: Admissible, reach: Reach, intervals: range, rows: 
 
 
 def least_deliveries(admissible: Admissible, reach: Reach, intervals: range, rows: ProgramRows) -> None:
-    """Add c·u·x_start − U, at most 0, of what is asked at least by schedule, u, and may be cut; keys (2, …).
+    """Add c·u·x_start − U, at most 0, of what is asked of a stock at least by schedule, u; keys (2, …).
 
     A donor delivers min(1, x_start·s/u_all) of it, concave in x_start, and so at least its chord c·x_start from 0. Of
-    the stocks at the very start, which are known, and of coarse pieces nothing is said.
+    the stocks at the very start, which are known, and of coarse pieces nothing is said. Where nothing can be cut the
+    row is there too, so that multipliers of one start are those of another.
     """
     layout, donors = rows.layout, rows.layout.network.donors
     if layout.coarse:
         return
     least = admissible.rate[0, intervals.start : intervals.stop]
     in_stages = np.isin(donors, [layout.network.node_index[whole.node.id] for whole in admissible.lifetimes.whole])
-    steps, arcs = np.nonzero(admissible.by_schedule & (least > 0) & ~reach.uncut & ~in_stages)
+    is_stock = donors < len(layout.network.stores)
+    steps, arcs = np.nonzero(admissible.by_schedule & (least > 0) & is_stock & ~in_stages)
     for piece in range(layout.pieces):
         has_start = steps > 0 if piece == 0 else np.ones(len(steps), dtype=bool)
         t, k = steps[has_start], arcs[has_start]
