@@ -260,7 +260,7 @@ def least_deliveries(admissible: Admissible, reach: Reach, intervals: range, row
 
     A donor delivers min(1, x_start·s/u_all) of it, concave in x_start, and so at least its chord c·x_start from 0. Of
     the stocks at the very start, which are known, and of coarse pieces nothing is said. Where nothing can be cut the
-    row is empty, but there, so that multipliers of one start are those of another.
+    row is −U ≤ 0, so that multipliers of one start are those of another.
     """
     layout, donors = rows.layout, rows.layout.network.donors
     if layout.coarse:
@@ -275,7 +275,7 @@ def least_deliveries(admissible: Admissible, reach: Reach, intervals: range, row
         start = t * layout.size + layout.end[piece - 1] - (layout.size if piece == 0 else 0)
         row, may_be_cut = rows.add(2, t, k, piece), np.where(reach.uncut[t, k], 0.0, 1.0)
         rows.put(row, start + donors[k], may_be_cut * least[t, k] * reach.chord[t, k])
-        rows.put(row, t * layout.size + layout.flow[piece * (layout.degree + 1)] + k, -may_be_cut)
+        rows.put(row, t * layout.size + layout.flow[piece * (layout.degree + 1)] + k, -1.0)
 
 
 def _idle_groups(admissible: Admissible) -> list[tuple[Integers, Floats]]:
