@@ -59,7 +59,7 @@ def test_levers_that_do_not_meet_bring_the_same_in_any_order() -> None:
     assert [without_bounds.changes(i) for i in range(3)] == [pytest.approx(result.changes(i)) for i in range(3)]
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_levers_that_meet_keep_the_service() -> None:
     """In a cycle every row delivers what there is as usual, but for a thousandth, and stays below its bound."""
     network = cycle().with_options(episode={"horizon": 2})

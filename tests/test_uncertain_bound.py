@@ -35,7 +35,7 @@ from cirl_marl import (
     load_network,
 )
 from cirl_marl.controllers import Constant, Controller, Neutral, Random
-from cirl_marl.controllers.rollout import first_seed
+from cirl_marl.controllers.rollout import first_seed, rollout
 from cirl_marl.evaluation import compare
 from cirl_marl.network.disturbances import BlockBootstrap, DisturbanceEffect, Gaussian, Markov
 from cirl_marl.network.elements import Lifetime
@@ -488,9 +488,32 @@ def test_prices_stand_on_all_that_is_in_use(lifetime: Lifetime) -> None:
 SEEDS = range(40)
 
 
+@pytest.mark.medium
+def test_substeps_of_large_programs_are_merged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Then a draw's program has one piece for an interval, proves nearly as much, and no less than what happens."""
+    network = load_network("car_batteries").scenario("adoption").with_options(episode={"horizon": 8})
+    env = MultiAgentVectorEnv(network, num_envs=3)
+    env.reset(seed=first_seed(0))
+    drawn, proofs = draws.draws_of(env), list[NDArray[np.float64]]()
+    for large, pieces in ((draws.LARGE_DRAW, 4), (1_000, 1)):
+        monkeypatch.setattr(draws, "LARGE_DRAW", large)
+        programs = [DrawProgram(draw, None, 1) for draw in drawn]
+        assert {program.layout.pieces for program in programs} == {pieces}
+        proofs.append(np.array([program.prove(program.problem).value for program in programs]))
+    assert proofs[1] == pytest.approx(proofs[0], rel=0.1)
+    for actions in np.linspace(-1.0, 1.0, 9):
+        policy = Constant(dict.fromkeys(network.agents, float(actions)))
+        reached = rollout(env, policy, seed=first_seed(0)).episode_circularity
+        assert (reached <= np.minimum(*proofs) + 1e-9 * np.abs(reached)).all()
+
+
 @pytest.mark.slow
-def test_no_policy_exceeds_it(make_network: Callable[..., Network]) -> None:
+@pytest.mark.parametrize("large", [draws.LARGE_DRAW, 0], ids=["fine", "merged"])
+def test_no_policy_exceeds_it(
+    large: int, make_network: Callable[..., Network], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """On at least twenty random networks: in every draw with the penalty, on average without it within the interval."""
+    monkeypatch.setattr(draws, "LARGE_DRAW", large)
     attacked = 0
     for seed in SEEDS:
         network = uncertain_network(make_network, seed)

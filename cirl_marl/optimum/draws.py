@@ -18,6 +18,11 @@ from cirl_marl.optimum.program import Program, Programs
 from cirl_marl.optimum.solver import Basis, Infeasible, SolverFailure, solve
 from cirl_marl.optimum.stock_values import stock_values
 
+LARGE_DRAW = 10_000
+"""Variables of a draw's program beyond which substeps are merged: it is solved under many prices, each of many draws.
+
+In copper_world and carbo_net HiGHS then needs 0.5 and 5 s, not 6 and 22, for bounds 0.2 % tighter and 0.6 % looser.
+"""
 MEMORIES = (0.7, 0.95)
 """Shares of means of the past that are left after an interval."""
 
@@ -139,7 +144,7 @@ class DrawProgram:
         """
         admissible = Admissible.of(draw.network, agents)
         self.draw, self._totals = draw, admissible.lifetimes.totals
-        self._programs = Programs(admissible, degree, service_weight, constant_shares=False)
+        self._programs = Programs(admissible, degree, service_weight, constant_shares=False, large=LARGE_DRAW)
         self.problem = self._programs.program(draw.initial)
         self.layout = self.problem.layout
 

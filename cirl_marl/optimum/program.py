@@ -88,6 +88,7 @@ class Programs:
         *,
         hold_controls: bool = False,
         merge_pieces: bool | None = None,
+        large: int = LARGE,
         constant_shares: bool = True,
         system: ComparisonSystem | None = None,
         intervals: range | None = None,
@@ -104,6 +105,7 @@ class Programs:
                 better plans and bounds nothing.
             merge_pieces: whether an interval has fewer pieces than the simulator has substeps; None: if the program
                 were large otherwise.
+            large: variables beyond which it is.
             constant_shares: whether shares of what passes nodes without stock are constant within an interval, unless
                 controls are held, the program is large or its layout is given.
             system: of a program of the same network and agents, whatever their services demand.
@@ -119,7 +121,7 @@ class Programs:
         self.system = system
         constant_shares = constant_shares and not hold_controls and layout is None
         self._transit: Transit | None = None
-        self.layout = layout = layout or _layout(admissible, system.substeps, merge_pieces, degree)
+        self.layout = layout = layout or _layout(admissible, system.substeps, merge_pieces, degree, large)
         if constant_shares and layout.size * len(admissible.kinds) <= LARGE:
             transit = Transit(admissible, system.substeps)
             if len(transit.splits):
@@ -242,7 +244,7 @@ def _reach(lifetimes: Lifetimes, system: ComparisonSystem, initial: Floats, inte
     ), lifetime_flow
 
 
-def _layout(admissible: Admissible, substeps: int, merge_pieces: bool | None, degree: int) -> Layout:
+def _layout(admissible: Admissible, substeps: int, merge_pieces: bool | None, degree: int, large: int) -> Layout:
     network, nodes = admissible.network, len(admissible.network.nodes)
     pieces = admissible.lifetimes.pieces(degree, substeps) if admissible.lifetimes.whole else substeps
     exits = np.bincount(network.donors[admissible.driver == network.donors], minlength=nodes)
@@ -253,8 +255,8 @@ def _layout(admissible: Admissible, substeps: int, merge_pieces: bool | None, de
     fine = Layout(network, pieces, degree, valves, free_valves, coarse=pieces < substeps)
     variables, entries = fine.size * network.episode.horizon, admissible.lifetimes.entries(fine)
     fewer = 0.0 if merge_pieces else float(pieces)
-    if merge_pieces is None and variables > LARGE:
-        fewer *= MERGED * LARGE / variables
+    if merge_pieces is None and variables > large:
+        fewer *= MERGED * large / variables
     if merge_pieces is None and entries > LARGE_KERNELS:
         fewer = min(fewer, pieces * math.sqrt(LARGE_KERNELS / entries))
     fewer_pieces = max(int(fewer), degree - 1, 1)

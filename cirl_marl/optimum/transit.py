@@ -210,11 +210,14 @@ class ConstantShares:
         if self.node_column[donor] < 0:
             return
         sources = self.transit.sources(np.zeros(self.stores, dtype=bool))[place]
-        for moment in range(len(self.layout.moments)):
-            for side in (0, 1):
-                row = self.rows.add(3, 0, arcs, moment, side)
-                self._put(row, donor, arcs, moment, side, -1.0)
-                self._allow_dry(row, donor, arcs, sources, 1.0)
+        moments = np.arange(len(self.layout.moments))
+        rows = self._add(0, arcs, moments)
+        self._put(rows, donor, arcs, moments, -1.0)
+        self._allow_dry(rows, donor, arcs, sources, 1.0)
+
+    def _add(self, choice: int, arcs: Integers, moments: Integers) -> Integers:
+        """Add rows for the least and the greatest share of arcs in some moments, shape (moments, 2, arcs)."""
+        return self.rows.add(3, choice, arcs, moments[:, None, None], np.arange(2)[:, None])
 
     def _write_chains(self, place: int, donor: int, arcs: Integers) -> None:
         """Write how fast (s − s̲)·B and (s̄ − s)·B can fall, for each choice of fast stocks."""
@@ -233,17 +236,16 @@ class ConstantShares:
         layout, d = self.layout, self.layout.degree
         means = special.hyp1f1(np.arange(d + 1) + 1, d + 2, -rate * layout.length)
         ratio = np.append(means[1:] / means[:-1], means[0] * np.exp(-rate * layout.length) / means[-1])
-        transients = self._transients(donor, sources.fast)
-        spread = self.ranges.rate[1, arcs] - self.ranges.rate[0, arcs]
-        for moment in range(len(layout.moments) - 1):
-            factor = float(ratio[moment % (d + 1)])
-            for side in (0, 1):
-                row = self.rows.add(3, choice, arcs, moment, side)
-                self._put(row, donor, arcs, moment, side, factor)
-                self._put(row, donor, arcs, moment + 1, side, -1.0)
-                self.rows.at_start(row[:, None], 0, sources.fast, -factor * spread[:, None] * transients[moment])
-                self._allow_dry(row, donor, arcs, sources, 1.0 + factor)
-                self._allow_varying(row, donor, spread, sources, moment, factor)
+        moments = np.arange(len(layout.moments) - 1)
+        factor = ratio[moments % (d + 1), None, None]
+        rows = self._add(choice, arcs, moments)
+        self._put(rows, donor, arcs, moments, factor)
+        self._put(rows, donor, arcs, moments + 1, -1.0)
+        spread = np.diff(self.ranges.rate[:, arcs], axis=0)[0, :, None]
+        transients = self._transients(donor, sources.fast)[moments, None, None]
+        self.rows.at_start(rows[..., None], 0, sources.fast, -factor[..., None] * spread * transients)
+        self._allow_dry(rows, donor, arcs, sources, 1.0 + factor)
+        self._allow_varying(rows, donor, spread, sources, moments, factor[..., None])
 
     def _transients(self, donor: int, fast: Integers) -> Floats:
         """Return what passes a node of a unit that each fast stock held at the start, in each moment."""
@@ -260,15 +262,15 @@ class ConstantShares:
         transients: Floats = flow @ np.concatenate(pieces)
         return transients
 
-    def _put(self, row: Integers, donor: int, arcs: Integers, moment: int, side: int, weight: float) -> None:
-        """Put ``weight`` times (s − s̲)·B, or (s̄ − s)·B on side 1, in a moment; a row for each of the arcs."""
-        layout, bound, rows = self.layout, self.ranges.rate[side, arcs], self.rows
-        weight *= (1.0, -1.0)[side]
-        rows.put(row, layout.flow[moment] + arcs, weight)
-        rows.put(row, layout.stock[moment] + donor, -weight * bound)
+    def _put(self, rows: Integers, donor: int, arcs: Integers, moments: Integers, weight: Floats | float) -> None:
+        """Put ``weight`` times (s − s̲)·B, or (s̄ − s)·B on side 1, in some moments."""
+        layout, bound, at = self.layout, self.ranges.rate[:, arcs], moments[:, None, None]
+        weight = weight * np.array([[1.0], [-1.0]])
+        self.rows.put(rows, layout.flow[at] + arcs, weight)
+        self.rows.put(rows, layout.stock[at] + donor, -weight * bound)
         if self.node_column[donor] >= 0:
-            rows.put(row, self.arc_column[arcs], -weight)
-            rows.put(row, self.node_column[donor], weight * bound)
+            self.rows.put(rows, self.arc_column[arcs], -weight)
+            self.rows.put(rows, self.node_column[donor], weight * bound)
 
     def _visits(self, donor: int, entries: Integers) -> Floats:
         """Return how much of what enters some nodes without stock passes another at the most."""
@@ -280,27 +282,26 @@ class ConstantShares:
         flow = self.linear.pass_flow[[donor - self.stores]][:, sources.fast]
         return float(flow.toarray().max(initial=0.0)) * self.interval * WIDER
 
-    def _allow_dry(self, row: Integers, donor: int, arcs: Integers, sources: Sources, factor: float) -> None:
-        """Allow for what changes in schedules whose donors may run dry, ``factor`` times; a row for each arc."""
+    def _allow_dry(self, rows: Integers, donor: int, arcs: Integers, sources: Sources, factor: Floats | float) -> None:
+        """Allow for what changes in schedules whose donors may run dry, ``factor`` times."""
         if self.layout.pieces == 1 and not self.layout.coarse:
             return
-        spread, (direct, behind) = (
-            factor * (self.ranges.rate[1, arcs] - self.ranges.rate[0, arcs])[:, None],
-            sources.dry,
-        )
-        self.rows.loosen(row[:, None], direct, spread * self._visits(donor, self.network.recipients[direct]))
-        self.rows.loosen(row[:, None], behind, spread * self._most_outflow(donor, sources))
+        direct, behind = sources.dry
+        spread = (factor * np.diff(self.ranges.rate[:, arcs], axis=0))[..., None]
+        self.rows.loosen(rows[..., None], direct, spread * self._visits(donor, self.network.recipients[direct]))
+        self.rows.loosen(rows[..., None], behind, spread * self._most_outflow(donor, sources))
 
     def _allow_varying(
-        self, row: Integers, donor: int, spread: Floats, sources: Sources, moment: int, ratio: float
+        self, rows: Integers, donor: int, spread: Floats, sources: Sources, moments: Integers, ratio: Floats
     ) -> None:
         """Allow for flows that may fall otherwise: they pass at once, and past fast stocks later."""
-        layout, rows, transit, (direct, behind) = self.layout, self.rows, self.transit, sources.varying
+        layout, transit, (direct, behind) = self.layout, self.transit, sources.varying
+        at = moments[:, None, None, None]
         # what flows by schedule is constant in a substep
-        is_substep = not layout.coarse and (moment + 1) % (layout.degree + 1) > 0
+        is_substep = (not layout.coarse) & ((at + 1) % (layout.degree + 1) > 0)
         kept = np.where(is_substep & self.ranges.by_schedule[transit.varying_flow[direct]], 1.0 - ratio, 1.0)
         weight = kept * transit.varying_part[direct] * self._visits(donor, transit.varying_entry[direct])
-        rows.put(row[:, None], layout.flow[moment] + transit.varying_flow[direct], -spread[:, None] * weight)
+        self.rows.put(rows[..., None], layout.flow[at] + transit.varying_flow[direct], -spread * weight)
         share = transit.varying_part[behind] * self._most_outflow(donor, sources) / len(layout.moments)
-        for column in layout.flow.tolist() if len(behind) else ():
-            rows.put(row[:, None], column + transit.varying_flow[behind], -spread[:, None] * share)
+        columns = layout.flow[:, None] + transit.varying_flow[behind]
+        self.rows.put(rows[..., None, None], columns, -spread[..., None] * share)

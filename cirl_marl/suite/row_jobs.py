@@ -110,16 +110,16 @@ class ResultJob:
 
 
 def _mpc_settings(task: BenchmarkTask) -> dict[str, Any]:
-    """Return horizon and margin of MPC; the margin is set where something disturbs what is planned for."""
-    network = task.network()
+    """Return horizon and margin of MPC in a task; the margin is set where something disturbs what is planned for."""
+    network, settings = task.network(), {"task": task.name, "horizon": None, "margin": 1.0}
     if not network.disturbed:
-        return {"horizon": None, "margin": 1.0}
+        return settings
     demand = demanded_levels(network, task.min_service)
 
     def make(margin: float = 1.0) -> MPC:
         return MPC(min_service=task.min_service, horizon=WINDOW, margin=margin)
 
-    return {"horizon": WINDOW, "margin": calibrate(task.env, make, demand, DISTURBED_EPISODES).margin}
+    return settings | {"horizon": WINDOW, "margin": calibrate(task.env, make, demand, DISTURBED_EPISODES).margin}
 
 
 def benchmark(
