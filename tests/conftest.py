@@ -7,7 +7,7 @@ import random
 import shutil
 import signal
 from collections import Counter, defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -116,6 +116,14 @@ def few_rollouts() -> Recipe:
     return Recipe(
         name="small", title="small", run=Run(steps=80, envs=2, engine="lockstep", evaluations=0), learner=learner
     )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def coarse_pictures() -> Iterator[None]:
+    """Write pictures with a quarter of the dots per inch: they take most of the time of the tests that draw."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("cirl_marl.drawing.style.DPI", 50)
+        yield
 
 
 @pytest.fixture

@@ -73,12 +73,15 @@ def test_schema_is_up_to_date() -> None:
     assert published == json.dumps(network_schema(), indent=2, ensure_ascii=False) + "\n"
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_files_pass_the_schema(path: Path) -> None:
+def test_files_pass_the_schema() -> None:
     """Editors accept what the library accepts."""
     schema = network_schema()
     jsonschema.Draft202012Validator.check_schema(schema)
-    jsonschema.validate(tomllib.loads(path.read_text(encoding="utf-8")), schema)
+    validator = jsonschema.Draft202012Validator(schema)
+    assert len(FILES) >= 10
+    for path in FILES:
+        errors = [error.message for error in validator.iter_errors(tomllib.loads(path.read_text(encoding="utf-8")))]
+        assert errors == [], path
 
 
 def test_schema_refuses_what_the_library_refuses() -> None:

@@ -98,6 +98,7 @@ def test_rows_and_boxes_hold_in_an_episode(lifetime: Lifetime, stretch: float | 
     assert room < 1e-2 * left.max()
 
 
+@pytest.mark.sample(4)
 @pytest.mark.parametrize("style", ["ends", "inside", "switch"])
 @pytest.mark.parametrize("lifetime", [LIVES[0], LIVES[2], Lifetime(mean=12.0, deviation=3.0, distribution="lognormal")])
 def test_rows_hold_however_a_lifetime_is_stretched(lifetime: Lifetime, style: str) -> None:
@@ -175,6 +176,7 @@ def test_no_episode_of_a_generated_cycle_exceeds_its_bound(seed: int) -> None:
 
 
 @pytest.mark.medium
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("seed", [106, 109])
 def test_no_improved_plan_of_a_cycle_exceeds_its_bound(seed: int) -> None:
     """Markets share out what leaves lifetimes, whose stages may be fast: its flow may fall as fast as it likes."""

@@ -31,6 +31,11 @@ from cirl_marl.report.curves import PointSeries, _by_scale, save_circularity, sa
 Picture = NDArray[np.float32]
 
 
+@pytest.fixture(scope="module", autouse=True)
+def coarse_pictures() -> None:
+    """Write pictures as fine as they are."""
+
+
 def read(path: Path) -> Picture:
     """Return a PNG that must not be blank."""
     assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"

@@ -102,7 +102,7 @@ def test_random_networks(network: Network, interval: float, seed: int) -> None:
     assert_as_good(smooth_plan(before), before)
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_orders_that_jump_calm_down() -> None:
     """A cycle with lifetimes, shares and orders: at most 0.6 of the changes, in the plan that users get."""
     found = improve_plan(bound(warehouse_cycle(10), min_service=1.0))

@@ -88,7 +88,7 @@ class Programs:
         *,
         hold_controls: bool = False,
         merge_pieces: bool | None = None,
-        large: int = LARGE,
+        large: int | None = None,
         constant_shares: bool = True,
         system: ComparisonSystem | None = None,
         intervals: range | None = None,
@@ -105,7 +105,7 @@ class Programs:
                 better plans and bounds nothing.
             merge_pieces: whether an interval has fewer pieces than the simulator has substeps; None: if the program
                 were large otherwise.
-            large: variables beyond which it is.
+            large: variables beyond which it is; None: ``LARGE``.
             constant_shares: whether shares of what passes nodes without stock are constant within an interval, unless
                 controls are held, the program is large or its layout is given.
             system: of a program of the same network and agents, whatever their services demand.
@@ -244,7 +244,9 @@ def _reach(lifetimes: Lifetimes, system: ComparisonSystem, initial: Floats, inte
     ), lifetime_flow
 
 
-def _layout(admissible: Admissible, substeps: int, merge_pieces: bool | None, degree: int, large: int) -> Layout:
+def _layout(
+    admissible: Admissible, substeps: int, merge_pieces: bool | None, degree: int, large: int | None = None
+) -> Layout:
     network, nodes = admissible.network, len(admissible.network.nodes)
     pieces = admissible.lifetimes.pieces(degree, substeps) if admissible.lifetimes.whole else substeps
     exits = np.bincount(network.donors[admissible.driver == network.donors], minlength=nodes)
@@ -254,7 +256,7 @@ def _layout(admissible: Admissible, substeps: int, merge_pieces: bool | None, de
     free_valves = np.flatnonzero(movable & (exits > 0) & (schedules > 0))
     fine = Layout(network, pieces, degree, valves, free_valves, coarse=pieces < substeps)
     variables, entries = fine.size * network.episode.horizon, admissible.lifetimes.entries(fine)
-    fewer = 0.0 if merge_pieces else float(pieces)
+    fewer, large = 0.0 if merge_pieces else float(pieces), LARGE if large is None else large
     if merge_pieces is None and variables > large:
         fewer *= MERGED * large / variables
     if merge_pieces is None and entries > LARGE_KERNELS:
