@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -126,7 +127,6 @@ class ObservationLayout:
         names: what each entry of an agent's observation is.
         array_order: stocks and inner states in the order in which all agents observe them and nothing else; empty if
             they see other things too, or different ones.
-        spaces: observation space of each agent; float32.
         sights: what disturbances show.
     """
 
@@ -163,10 +163,8 @@ class ObservationLayout:
         rows = [list(dict.fromkeys(self._rows(agent, mode))) for agent in agents]
         self._index: Integers = np.array([row for of_agent in rows for row in of_agent], dtype=np.intp)
         self.slices = dict(zip(agents, spans(map(len, rows)), strict=True))
-        low, high = self._bounds(dynamics)
-        by_agent = dict(zip(agents, rows, strict=True))
-        self.spaces = {a: Box(low[entries], high[entries], dtype=np.float32) for a, entries in by_agent.items()}
-        self.names = {agent: tuple(names[row] for row in entries) for agent, entries in by_agent.items()}
+        self._dynamics, self._rows_of = dynamics, dict(zip(agents, rows, strict=True))
+        self.names = {agent: tuple(names[row] for row in entries) for agent, entries in self._rows_of.items()}
         self.array_order = self._common_order(agents, mode)
         scales = np.array([c.scale for c in network.compartments.values()])
         inside = np.ones(signals.loads.start - signals.states.start)
@@ -178,6 +176,12 @@ class ObservationLayout:
         self._table = np.zeros((signals.rows, batch), dtype=np.float32)
         self._table[signals.set_points] = set_points[:, None]
         self._signal_sum = RowSum(self._index, np.arange(len(self._index)), 1.0, (signals.rows, len(self._index)))
+
+    @cached_property
+    def spaces(self) -> dict[str, Box[np.float32]]:
+        """Observation space of each agent; float32. Bounds of a large network take as long as its episode."""
+        low, high = self._bounds(self._dynamics)
+        return {agent: Box(low[rows], high[rows], dtype=np.float32) for agent, rows in self._rows_of.items()}
 
     def observe(
         self, quantities: Floats, time: Floats, levels: Floats, sight: Floats | None = None, table: Any = None

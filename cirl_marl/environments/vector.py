@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gymnasium.spaces import Box
 from numpy.typing import ArrayLike, NDArray
 
 from cirl_marl.definitions.catalogue import load_network
@@ -63,7 +64,6 @@ class MultiAgentVectorEnv:
         agents: compartments that act, in the order of every stacked array.
         uncertain: whether the uncertain numbers are drawn.
         reward_mode: one of those of ``rewards.Credit``.
-        observation_spaces: by agent.
         observation_names: by agent, what each entry of its observation is.
         action_spaces: by agent; Box(−1, 1), mapped linearly to the bounds of the control.
         rows: which row of the physical state is what.
@@ -139,7 +139,6 @@ class MultiAgentVectorEnv:
         self.scoring = Scoring(self.dynamics, self.layout, self.agents, num_envs)
         self.idle = self.supply.idle(self.agents)
         self._credit = Credit(self.dynamics, self.supply, self.scoring, self.agents, self.reward_mode, moment)
-        self.observation_spaces = self.layout.spaces
         self.observation_names = self.layout.names
         self._starts = Starts(variant, self.dynamics, num_envs, self.layout.array_order)
         self.rows = self.dynamics.rows
@@ -155,6 +154,11 @@ class MultiAgentVectorEnv:
     def __str__(self) -> str:
         """Return the name of the network and its scenario, as in ids of environments."""
         return environment_name(self.network)
+
+    @property
+    def observation_spaces(self) -> dict[str, Box[np.float32]]:
+        """Observation space of each agent; float32."""
+        return self.layout.spaces
 
     @property
     def circularity_weight(self) -> float:

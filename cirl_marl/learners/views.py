@@ -46,8 +46,11 @@ class BatchedEnv(Protocol):
 
     num_envs: int
     agents: tuple[str, ...]
-    observation_spaces: Any
     action_spaces: Any
+
+    @property
+    def observation_spaces(self) -> Any:
+        """Observation space of each agent."""
 
     def reset(self, *, seed: Any = None) -> Any:
         """Begin episodes in all copies and return the first observations."""
