@@ -583,6 +583,40 @@ def test_shares_of_what_orders_take_away(style: str) -> None:
         assert_holds(play(network, np.random.default_rng(degree), style), degree)
 
 
+@pytest.mark.parametrize("merged", [False, True])
+@pytest.mark.parametrize(("past", "refilled"), [("sale", True), ("furnace", True), ("sale", False), ("furnace", False)])
+def test_shares_of_what_a_hoard_has_left(past: str, refilled: bool, merged: bool) -> None:
+    """A market gets what was ordered from a hoard, or less where that runs dry, at once or past a furnace."""
+    order = Control(kind=ControlKind.FLOW, low=0.0, neutral=5.0, high=30.0)
+    share = Control(kind=ControlKind.SHARE, low=0.1, neutral=0.5, high=0.9)
+    network = Network(
+        name="market",
+        nodes=(
+            Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR, initial=(500.0, 500.0)),
+            Node(id="hoard", initial=(6.0, 6.0)),
+            Node(id="furnace", initial=(1.0, 1.0)),
+            Node(id="yard", initial=(10.0, 10.0)),
+            Node(id="first", initial=(1.0, 1.0)),
+            Node(id="second", initial=(1.0, 1.0)),
+            Node(id="sale", stores=False),
+        ),
+        arcs=(
+            Arc(id="feed", donor="mine", recipient="hoard" if refilled else "yard", law=Law.EXOGENOUS, flow=4.0),
+            Arc(id="order", donor="hoard", recipient=past, law=Law.CONTROLLED, control=order),
+            Arc(id="melt", donor="furnace", recipient="sale", rate=12.0),
+            Arc(id="release", donor="yard", recipient="sale", rate=0.2),
+            Arc(id="to_first", donor="sale", recipient="first", law=Law.SHARE, control=share),
+            Arc(id="to_second", donor="sale", recipient="second", law=Law.SHARE),
+            Arc(id="back", donor="first", recipient="yard", rate=1.0),
+        ),
+        episode=Episode(control_interval=1.0, horizon=5, solver_step=0.25),
+        objective=Objective(circularity_scale=1.0),
+    )
+    for seed, style in enumerate(("inside", "ends", "high")):
+        for degree in (1, 2):
+            assert_holds(play(network, np.random.default_rng(seed), style), degree, None, merged)
+
+
 def test_shares_are_the_same_all_year() -> None:
     """A market cannot give one product what comes early and another what comes late.
 
