@@ -251,7 +251,7 @@ def can_stop(name: str) -> bool:
 
 
 @pytest.mark.medium
-@pytest.mark.sample(2)
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("name", [*filter(can_stop, ONE_OF_EACH)])
 def test_zero_throughput_is_not_best(name: str) -> None:
     """Stopping everything is good for λ, but the service fails and the mixed reward falls.

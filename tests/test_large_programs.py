@@ -141,6 +141,7 @@ def test_plans_of_large_networks_make_up_for_what_lacked(monkeypatch: pytest.Mon
     assert penalised_objective(found, after, charged) > penalised_objective(found, before, charged)
 
 
+@pytest.mark.slow
 def test_what_stocks_can_be_is_compiled_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """A bound, its better plans and what it proves elsewhere share the routes; what is sent elsewhere leaves them."""
     compiled: list[int] = []

@@ -175,8 +175,7 @@ def test_no_episode_of_a_generated_cycle_exceeds_its_bound(seed: int) -> None:
             assert run.episode_circularity[0] <= found.objective + 1e-9 * abs(found.objective)
 
 
-@pytest.mark.medium
-@pytest.mark.sample(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [106, 109])
 def test_no_improved_plan_of_a_cycle_exceeds_its_bound(seed: int) -> None:
     """Markets share out what leaves lifetimes, whose stages may be fast: its flow may fall as fast as it likes."""

@@ -124,8 +124,7 @@ def test_a_service_out_of_reach_is_approached() -> None:
     np.testing.assert_allclose(run.service[0, 4:], 1.0, atol=1e-3)
 
 
-@pytest.mark.medium
-@pytest.mark.sample(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1.0, 100.0])
 def test_a_short_window_sees_what_comes_after_where_the_service_is_out_of_reach(scale: float) -> None:
     """A long chain has to be filled early, which a window of four decisions learns from prices alone, in their unit."""

@@ -97,6 +97,7 @@ def test_package_needs_no_matplotlib() -> None:
     assert (done.returncode, done.stdout) == (0, ""), done.stderr
 
 
+@pytest.mark.sample(4)
 @pytest.mark.parametrize("name", ONE_OF_EACH)
 def test_catalogue_is_readable(name: str) -> None:
     """No box or label hides another; but for networks of more than twenty arcs no arrow passes behind a box."""

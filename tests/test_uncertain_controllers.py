@@ -100,7 +100,7 @@ def certain_process(network: Network) -> Network:
     return found
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_without_noise_all_plans_are_one(make_network: Callable[..., Network]) -> None:
     """Where a process never changes, MPC, with conditional means or with futures, is that of the network without."""
     compared = 0
@@ -226,7 +226,7 @@ def test_batches_do_as_they_do_alone_and_seeds_reproduce() -> None:
         np.testing.assert_allclose(runs[0].circularity[1], runs[2].circularity[0], rtol=1e-9)
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_the_best_schedule_is_near_the_bound_where_nothing_is_drawn() -> None:
     """Within 1 %, at the service demanded."""
     chain = Markov(values=(1.0, 1.0), lengths=(2.0, 3.0))

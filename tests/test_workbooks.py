@@ -90,6 +90,7 @@ def test_hostile_sheets_are_refused(
 ) -> None:
     """In a line, soon, and in little memory."""
     monkeypatch.setattr(workbooks, "CELLS", 10**6)
+    monkeypatch.setattr(workbooks, "ROWS", 2**16)
     rewritten(book, change)
     began = time.process_time()
     tracemalloc.start()
