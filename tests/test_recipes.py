@@ -225,7 +225,6 @@ def test_mistakes_that_need_the_network_are_named(tmp_path: Path) -> None:
         "n_steps = 1": "n_steps",
         "policy_kwargs = { optimizer_kwargs = { lrr = 1.0 } }": "lrr",
         "policy_kwargs = { net_ach = [8] }": "unexpected keyword argument 'net_ach'",
-        "policy_kwargs = { net_arch = [8.5] }": "must be tuple of ints",
         "policy_kwargs = { use_sde = true }": "multiple values for keyword argument 'use_sde'",
         'policy_kwargs = { activation_fn = "tanh" }': "'str' object is not callable",
     }.items():
@@ -286,6 +285,25 @@ def test_whole_episodes_need_a_single_environment(tmp_path: Path) -> None:
         train("copper_net", path, envs=2, directory=tmp_path / "run")
     assert not (tmp_path / "run").exists()
     train("copper_net", path, envs=1, steps=3, agents=["mine"], horizon=2)
+
+
+@pytest.mark.parametrize(
+    ("layers", "place"),
+    [
+        ([8, -1], ".1"),
+        ([0], ".0"),
+        ([10**30], ".0"),
+        ([True], ".0"),
+        ([1.5], ".0"),
+        ({"pi": [8], "vf": [8, -1]}, ".vf.1"),
+    ],
+)
+def test_layers_have_units(layers: Any, place: str) -> None:
+    """The library leaves it to PyTorch to refuse a layer of −1 units, which is no mistake of a recipe there."""
+    (mistake,) = parameter_mistakes("PPO", {"policy_kwargs": {"net_arch": layers}})
+    assert mistake.startswith(f"parameters.policy_kwargs.net_arch{place}: a layer has 1 to 65,536 units, got ")
+    for good in ([8, 8], {"pi": [8], "vf": [65536]}, []):
+        assert list(parameter_mistakes("PPO", {"policy_kwargs": {"net_arch": good}})) == []
 
 
 def test_lists_stand_for_tuples() -> None:

@@ -39,6 +39,8 @@ BOUNDS = {
 }
 """Lowest and highest number of parameters whose annotations do not say it: discount factors and how far a target
 network moves; numbers of steps, passes, transitions and perturbations; rates and distances."""
+WIDEST = 2**16
+"""Most units of a layer."""
 NOISES: Mapping[str, type[ActionNoise]] = {
     "normal": NormalActionNoise,
     "ornstein_uhlenbeck": OrnsteinUhlenbeckActionNoise,
@@ -111,6 +113,17 @@ def parameter_mistakes(name: str, parameters: Mapping[str, Any]) -> Iterator[str
                 yield from TABLE_CHECKS[key](place, value)
             else:
                 yield f"{place}: {name} needs {_requirement(signature[key])}, got {value!r}"
+        elif key == "policy_kwargs" and value:
+            yield from _width_mistakes(f"{place}.net_arch", value.get("net_arch"))
+
+
+def _width_mistakes(place: str, value: object) -> Iterator[str]:
+    """Yield every width that no layer has, in lists and in tables of lists."""
+    if isinstance(value, Mapping | list | tuple):
+        for key, part in value.items() if isinstance(value, Mapping) else enumerate(value):
+            yield from _width_mistakes(f"{place}.{key}", part)
+    elif isinstance(value, int | float) and (isinstance(value, bool | float) or not 1 <= value <= WIDEST):
+        yield f"{place}: a layer has 1 to {WIDEST:,} units, got {value!r}"
 
 
 def _not_finite(place: str, value: object) -> Iterator[str]:
