@@ -251,6 +251,17 @@ def test_bad_tables_and_files_are_named(trained: Path, tmp_path: Path) -> None:
     assert last_digit("0.00310") == pytest.approx(1e-5)
 
 
+def test_no_two_files_of_weights_are_alike(tmp_path: Path) -> None:
+    """What checks the wheel refuses files that are the same, also where a planner has nothing to keep."""
+    hashes = {
+        name: write_weights(tmp_path / name, {}, row_jobs._mpc_settings(load_task(name)))
+        for name in (TASK, "aluminium_world-v0")
+    }
+    assert len(set(hashes.values())) == 2
+    kept = [row.sha256 for row in read_rows() if row.sha256 and not row.variant]
+    assert len(set(kept)) == len(kept) > 20
+
+
 def test_what_is_kept_is_whole_and_small() -> None:
     """Every kept row has the weights that it names and no file is nobody's; all of it is small."""
     rows = read_rows()
