@@ -3,6 +3,7 @@
 python -m benchmarks.foresight [NETWORK ...]            # bounds worlds of benchmarks.uncertain, and who acts there
 python -m benchmarks.foresight paper_city --only mpc    # measures some; what is known of others stays
 python -m benchmarks.foresight paper_city --information # what it costs MPC to see disturbances late, or never
+python -m benchmarks.foresight paper_city --sight       # what learners gain from seeing more, and lose by seeing less
 python -m benchmarks.foresight --table                  # writes the tables of what is kept in results/foresight.json
 
 Each contender has a knob, which is set on draws of its own so that the lowest expected service is what is demanded; all
@@ -13,10 +14,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,11 +32,12 @@ from benchmarks.uncertain import contenders as simple_contenders
 from cirl_marl import MultiAgentVectorEnv, Network, Trained, bound, load_network, train
 from cirl_marl.controllers import Controller
 from cirl_marl.controllers.basic import Arrays
-from cirl_marl.controllers.rollout import first_seed, rollout
+from cirl_marl.controllers.rollout import Rollout, first_seed, rollout
 from cirl_marl.definitions.writer import fingerprint
-from cirl_marl.evaluation.calibration import calibrate
-from cirl_marl.evaluation.statistics import over_episodes, worst_mean
+from cirl_marl.evaluation.calibration import Calibration, calibrate
+from cirl_marl.evaluation.statistics import Aggregate, over_episodes, worst_mean
 from cirl_marl.network import Floats
+from cirl_marl.network.elements import Observe
 from cirl_marl.optimum.draw_proofs import Sampling
 from cirl_marl.optimum.draws import Prices
 from cirl_marl.optimum.mpc import MPC
@@ -57,6 +60,17 @@ LEARNERS = ("exact_gradients",)
 NEVER = -1
 LATE = {"at once": 0, "an interval late": 1, "four intervals late": 4, "never": NEVER}
 """How late disturbances are seen, in intervals, by name; stocks always are."""
+DELAYED = [*LATE][1:]
+SIGHT: Mapping[str, tuple[Observe, Mapping[str, Any]]] = {
+    "local": ("local", {}),
+    "neighbours": ("neighbours", {}),
+    "all stocks": ("full", {}),
+    "late": ("local", {"delayed": 1}),
+    "never": ("local", {"observed": "none"}),
+    "forecasts of 1": ("local", {"forecast": 1}),
+    "of 4": ("local", {"forecast": 4}),
+}
+"""What learners see, by name: the observation mode, and what is seen of every disturbance; the first is compared to."""
 BY_DRAW, PRICES = (
     ("values", "informed_values", "luck", "informed_luck", "gross_mass"),
     ("prices", "informed_prices"),
@@ -74,9 +88,9 @@ def _simple(name: str, world: World, found: UncertainBound) -> Maker:
 
 
 CONTENDERS: Mapping[str, Callable[[World, UncertainBound], Maker]] = {
-    **{name: partial(_simple, name) for name in SIMPLE},
     "best_constant": lambda world, found: controllers_by_margin("best_constant", min_service=DEMANDED),
     "best_schedule": lambda world, found: controllers_by_margin("best_schedule", min_service=DEMANDED),
+    **{name: partial(_simple, name) for name in SIMPLE},
     "mpc": lambda world, found: partial(MPC, min_service=DEMANDED, horizon=WINDOW),
     "scenario_mpc": lambda world, found: partial(MPC, min_service=DEMANDED, horizon=WINDOW, futures=FUTURES),
     "price_policy": lambda world, found: partial(MPC, min_service=DEMANDED, prices=found.prices),
@@ -105,13 +119,24 @@ class Alternating(Controller):
         return actions
 
 
-def learners(recipe: str, world: World, seeds: Sequence[int], steps: int | None) -> Alternating:
-    """Return what a recipe learns from several seeds; runs are kept in runs/foresight, and used again."""
+def seen_by(network: Network, sight: str) -> Network:
+    """Return a network in which agents see what ``SIGHT`` says."""
+    mode, seen = SIGHT[sight]
+    network = network.with_options(observation={"mode": mode})
+    if not seen:
+        return network
+    seen = {"observed": "now", "delayed": 0, "forecast": 0, **seen}
+    disturbances = {id_: replace(disturbance, **seen) for id_, disturbance in network.disturbances.items()}
+    return replace(network, disturbances=disturbances)
+
+
+def learners(recipe: str, network: Network, sight: str, seeds: Sequence[int], steps: int | None) -> Alternating:
+    """Return what a recipe learns in a network from several seeds; runs are kept in runs/foresight, and used again."""
     teams = list[Controller]()
     for seed in seeds:
-        directory = RUNS / f"{world.network}-{recipe}-{seed}"
+        directory = RUNS / "-".join((network.name, *sight.split(), recipe, str(seed)))
         if not directory.is_dir():
-            train(world.network, recipe, scenario=world.scenario, seed=seed, steps=steps, directory=directory)
+            train(network, recipe, seed=seed, steps=steps, directory=directory)
         teams.append(Trained(directory))
     return Alternating(teams)
 
@@ -123,7 +148,7 @@ def _whatever_margin(controller: Controller) -> Maker:
 def proof(world: World, sampling: Sampling) -> tuple[UncertainBound, float]:
     """Return the bound of a world without its certificates, and the processor time that it took, s.
 
-    It is kept in a file, for contenders that come later.
+    It is kept in a file, for contenders that come later; what is proved of draws is kept in runs/foresight meanwhile.
     """
     network = load_network(world.network).scenario(world.scenario)
     path, question = BOUNDS / f"{world.network}.npz", f"{fingerprint(network)} {DEMANDED} {sampling}"
@@ -132,7 +157,12 @@ def proof(world: World, sampling: Sampling) -> tuple[UncertainBound, float]:
             if str(arrays["question"]) == question:
                 return _kept(network, sampling, arrays), float(arrays["seconds"])
     began = time.process_time()
-    found = bound(network, min_service=DEMANDED, degree=1, uncertain=sampling)
+    found = bound(
+        network,
+        min_service=DEMANDED,
+        degree=1,
+        uncertain=replace(sampling, directory=RUNS / f"{network.name}-draws"),
+    )
     seconds = time.process_time() - began
     _keep(path, found, question=np.array(question), seconds=np.array(seconds))
     return found, seconds
@@ -186,8 +216,7 @@ def measured(
     """Return the figures of a contender on the first draws of a bound, its margin set on others if ``tune`` says so."""
     network, figures = found.network, dict[str, Any]()
     if tune is not None:
-        demand = np.full(len(network.services), DEMANDED)
-        calibration = calibrate(lambda copies: MultiAgentVectorEnv(network, num_envs=copies), make, demand, tune)
+        calibration = calibration_of(network, make, tune)
         margin, figures = calibration.margin, {"tuned_on": tune, "excess": calibration.excess}
     run = rollout(
         MultiAgentVectorEnv(network, num_envs=episodes), make(margin=margin), seed=first_seed(found.sampling.seed)
@@ -195,14 +224,13 @@ def measured(
     for key, informed in (("gap", False), ("foresight_gap", True)):
         gaps = found.gaps(run.episode_circularity, run.episode_levels, with_foresight=informed)
         figures[key] = over_episodes(gaps).as_dict()
-    levels = dict(zip((s.id for s in network.services), run.episode_levels.T, strict=True))
     figures |= {
         "knob": margin,
         "draws": episodes,
         "circularity": over_episodes(run.episode_circularity).as_dict(),
         "worst_circularity": worst_mean(run.episode_circularity).as_dict(),
-        "levels": {service: over_episodes(level, (0.0, 1.0)).as_dict() for service, level in levels.items()},
-        "worst_levels": {service: worst_mean(level).as_dict() for service, level in levels.items()},
+        "levels": _by_service(network, run, _expected_level),
+        "worst_levels": _by_service(network, run, worst_mean),
         "milliseconds": 1e3 * run.control_seconds / run.circularity.size,
     }
     sys.stdout.write(f"{network.name} {name}: {json.dumps(figures)}\n")
@@ -210,37 +238,89 @@ def measured(
     return figures
 
 
-def information(world: World, found: UncertainBound, margin: float, episodes: int) -> dict[str, Any]:
-    """Return the gaps of MPC with a ``margin`` that sees disturbances late, and what is lost to that at once."""
+def _by_service(network: Network, run: Rollout, figure: Callable[[Floats], Aggregate]) -> dict[str, Any]:
+    """Return a figure of the mean level of each service, by its id."""
+    levels = zip(network.services, run.episode_levels.T, strict=True)
+    return {service.id: figure(level).as_dict() for service, level in levels}
+
+
+def _expected_level(levels: Floats) -> Aggregate:
+    return over_episodes(levels, (0.0, 1.0))
+
+
+def calibration_of(network: Network, make: Maker, draws: int) -> Calibration:
+    """Return the margin at which what is made delivers what is demanded, on draws of its own."""
+    demand = np.full(len(network.services), DEMANDED)
+    return calibrate(lambda copies: MultiAgentVectorEnv(network, num_envs=copies), make, demand, draws)
+
+
+def information(world: World, found: UncertainBound, tune: int, episodes: int) -> dict[str, Any]:
+    """Return the gaps of MPC that sees disturbances late, its knob set anew, and what is lost to that at once."""
     network, figures, gaps = found.network, dict[str, Any](), dict[str, Floats]()
     for name, delay in LATE.items():
         late = network.episode.horizon if delay == NEVER else delay
-        planner = MPC(min_service=DEMANDED, horizon=WINDOW, margin=margin, delay=late)
-        run = rollout(MultiAgentVectorEnv(network, num_envs=episodes), planner, seed=first_seed(found.sampling.seed))
+        planner = partial(MPC, min_service=DEMANDED, horizon=WINDOW, delay=late)
+        margin = calibration_of(network, planner, tune).margin
+        env = MultiAgentVectorEnv(network, num_envs=episodes)
+        run = rollout(env, planner(margin=margin), seed=first_seed(found.sampling.seed))
         gaps[name] = found.gaps(run.episode_circularity, run.episode_levels)
         figures[name] = {
             "gap": over_episodes(gaps[name]).as_dict(),
             "loss": over_episodes(gaps[name] - gaps["at once"]).as_dict(),
-            "level": float(run.episode_levels.mean(axis=0).min()),
+            "knob": margin,
+            "levels": _by_service(network, run, _expected_level),
         }
         sys.stdout.write(f"{world.network} {name}: {json.dumps(figures[name])}\n")
         sys.stdout.flush()
     return {"draws": episodes, "seen": figures}
 
 
+def value_of_sight(world: World, found: UncertainBound, recipe: str, seeds: int, steps: int | None) -> dict[str, Any]:
+    """Return the gaps of what a recipe learns from each of some ``seeds``, by what it sees, and what that gains."""
+    figures, gaps = dict[str, Any](), dict[str, Floats]()
+    for sight in SIGHT:
+        network, means, levels = seen_by(found.network, sight), list[float](), list[float]()
+        for seed in range(1, seeds + 1):
+            env = MultiAgentVectorEnv(network, num_envs=found.sampling.draws)
+            run = rollout(env, learners(recipe, network, sight, [seed], steps), seed=first_seed(found.sampling.seed))
+            means.append(float(found.gaps(run.episode_circularity, run.episode_levels).mean()))
+            levels.append(float(run.episode_levels.mean(axis=0).min()))
+        gaps[sight] = np.array(means)
+        figures[sight] = {
+            "gap": over_episodes(gaps[sight]).as_dict(),
+            "change": over_episodes(gaps[sight] - gaps["local"]).as_dict(),
+            "level": min(levels),
+        }
+        sys.stdout.write(f"{world.network} {sight}: {json.dumps(figures[sight])}\n")
+        sys.stdout.flush()
+    return {"seeds": seeds, "steps": steps, "seen": figures}
+
+
+def sight_table(results: Mapping[str, Any]) -> str:
+    """Return what learners gain from seeing more, a row for each world."""
+    others, rows = [*SIGHT][1:], []
+    for world, entry in entries(results):
+        if "sight" in entry:
+            seen = entry["sight"]["seen"]
+            changes = (_percent(seen[name]["change"], signed=True) for name in others)
+            level = f"{min(figures['level'] for figures in seen.values()):.4f}"
+            rows.append(
+                (f"`{world.network}`", _percent(seen["local"]["gap"]), *changes, level, str(entry["sight"]["seeds"]))
+            )
+    return markdown_table(("world", "gap if all is local, %", *others, "lowest service", "seeds"), rows)
+
+
 def information_table(results: Mapping[str, Any]) -> str:
     """Return what it costs to see late, a row for each world."""
-    rows = [
-        (
-            f"`{world.network}`",
-            _percent(entry["information"]["seen"]["at once"]["gap"]),
-            *(f"+{_percent(entry['information']['seen'][name]['loss'])}" for name in [*LATE][1:]),
-            str(entry["information"]["draws"]),
-        )
-        for world, entry in entries(results)
-        if "information" in entry
-    ]
-    return markdown_table(("world", "gap if seen at once", *[*LATE][1:], "draws"), rows)
+    rows = []
+    for world, entry in entries(results):
+        if "information" in entry:
+            seen = entry["information"]["seen"]
+            cells = [_percent(seen["at once"]["gap"]), *(_percent(seen[name]["loss"], signed=True) for name in DELAYED)]
+            services = [_service(seen[name]["levels"]) for name in LATE]
+            cells = [f"{cell}<br>{service}" for cell, service in zip(cells, services, strict=True)]
+            rows.append((f"`{world.network}`", *cells, str(entry["information"]["draws"])))
+    return markdown_table(("world", "gap if seen at once, %", *DELAYED, "draws"), rows)
 
 
 def table(results: Mapping[str, Any]) -> str:
@@ -248,8 +328,8 @@ def table(results: Mapping[str, Any]) -> str:
     columns = (
         "world",
         "who acts",
-        "gap to the bound",
-        "to perfect information",
+        "gap to the bound, %",
+        "to perfect information, %",
         "lowest service",
         "λ̄",
         "of the 5 % worst",
@@ -267,27 +347,34 @@ def _rows(results: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
         yield "", "perfect information", "", "", "", _mass(informed), "", "", f"{entry['draws']}"
         for name in [name for name in (*CONTENDERS, *LEARNERS) if name in entry["contenders"]]:
             figures = entry["contenders"][name]
-            service = min(figures["levels"], key=lambda id_: float(figures["levels"][id_]["value"]))
-            level = figures["levels"][service]["value"]
             yield (
                 "",
                 name.replace("_", " ") + (f", seeds: {figures['seeds']}" if name in LEARNERS else ""),
                 _percent(figures["gap"]),
                 _percent(figures["foresight_gap"]),
-                f"{level:.4f}{'' if abs(level - DEMANDED) <= CLOSE else ' (missed)'}",
-                _mass(figures["circularity"]["value"]),
-                _mass(figures["worst_circularity"]["value"]),
+                _service(figures["levels"]),
+                _mass(figures["circularity"]["value"], figures["circularity"]),
+                _mass(figures["worst_circularity"]["value"], figures["worst_circularity"]),
                 f"{figures['milliseconds']:.0f}" if figures["milliseconds"] >= NOTICEABLE else "",
                 f"{figures['draws']}",
             )
 
 
-def _mass(value: float) -> str:
-    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+def _mass(value: float, interval: Mapping[str, float] | None = None) -> str:
+    digits = 0 if abs(value) >= 1000 else max(0, 3 - math.floor(math.log10(max(abs(value), 1e-9))))
+    doubt = "" if interval is None else f" ± {(interval['high'] - interval['low']) / 2:.{digits}f}"
+    return f"{value:.{digits}f}{doubt}"
 
 
-def _percent(figure: Mapping[str, float]) -> str:
-    return f"{100 * figure['value']:.2f} ± {50 * (figure['high'] - figure['low']):.2f} %"
+def _service(levels: Mapping[str, Mapping[str, float]]) -> str:
+    """Return the lowest expected level with its interval, and whether that is not within CLOSE of what is demanded."""
+    level = min(levels.values(), key=lambda figure: figure["value"])
+    doubt, off = (level["high"] - level["low"]) / 2, abs(level["value"] - DEMANDED)
+    return f"{level['value']:.4f} ± {doubt:.4f}{' (missed)' if off > CLOSE + doubt else ''}"
+
+
+def _percent(figure: Mapping[str, float], signed: bool = False) -> str:
+    return f"{100 * figure['value']:{'+' if signed else ''}.2f} ± {50 * (figure['high'] - figure['low']):.2f}"
 
 
 def main() -> None:
@@ -297,10 +384,11 @@ def main() -> None:
     parser.add_argument("--table", action="store_true", help="measure nothing")
     parser.add_argument("--only", default=",".join((*CONTENDERS, *LEARNERS)), help="contenders; default: all")
     parser.add_argument("--information", action="store_true", help="of MPC, instead")
+    parser.add_argument("--sight", action="store_true", help="what learners gain from it, instead")
     parser.add_argument("--draws", type=int, default=200, help="of which the bound is the mean")
     parser.add_argument("--fit-draws", type=int, default=64, help="others, to which prices are fitted")
     parser.add_argument("--tune", type=int, default=32, help="draws on which margins of those that plan are set")
-    parser.add_argument("--seeds", type=int, default=1, help="trainings of learners, which take turns in the draws")
+    parser.add_argument("--seeds", type=int, default=2, help="trainings of learners, which take turns in the draws")
     parser.add_argument("--steps", type=int, help="of a training; default: the recipe's")
     parser.add_argument("--episodes", type=int, default=64, help="of those that plan for every decision")
     options = parser.parse_args()
@@ -309,21 +397,29 @@ def main() -> None:
             continue
         found, seconds = proof(world, Sampling(draws=options.draws, fit_draws=options.fit_draws, numbers=False))
         if options.information:
+            figures = information(world, found, options.tune, options.episodes)
             results = json.loads(RESULTS.read_text())
-            margin = results[world.network]["contenders"].get("mpc", {}).get("knob", 1.0)
-            results[world.network]["information"] = information(world, found, margin, options.episodes)
+            results[world.network]["information"] = figures
+            write_json(RESULTS, results)
+            continue
+        if options.sight:
+            gained = value_of_sight(world, found, LEARNERS[0], options.seeds, options.steps)
+            results = json.loads(RESULTS.read_text())
+            results[world.network]["sight"] = gained
             write_json(RESULTS, results)
             continue
         for name in options.only.split(","):
             episodes = min(options.episodes, options.draws) if name in PLANNERS else options.draws
-            tune, margin = options.tune, 1.0
+            seen, tune, margin = found, options.tune, 1.0
             if name in SIMPLE:
                 tune, margin = None, json.loads(KNOBS.read_text())[world.network]["contenders"][name]["knob"]
             if name in LEARNERS:
-                tune, make = None, _whatever_margin(learners(name, world, range(1, options.seeds + 1), options.steps))
+                seen = replace(found, network=seen_by(found.network, "local"))
+                seeds = range(1, options.seeds + 1)
+                tune, make = None, _whatever_margin(learners(name, seen.network, "local", seeds, options.steps))
             else:
                 make = CONTENDERS[name](world, found)
-            figures = measured(name, make, found, tune, episodes, margin)
+            figures = measured(name, make, seen, tune, episodes, margin)
             if name in LEARNERS:
                 figures |= {"seeds": options.seeds, "steps": options.steps}
             results = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {}
@@ -332,7 +428,10 @@ def main() -> None:
             results[world.network] = {**entry, **bound_figures(found, seconds), "contenders": rows}
             write_json(RESULTS, results)
     results = json.loads(RESULTS.read_text())
-    write_sections(DOCUMENT, {"foresight": table(results), "information": information_table(results)})
+    write_sections(
+        DOCUMENT,
+        {"foresight": table(results), "information": information_table(results), "sight": sight_table(results)},
+    )
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """What Japan has to decide now and what it may decide later, for ``docs/japan.md``: each lever settled beforehand.
 
 Who looks every year acts by the price policy. A lever is settled if it follows, whatever happens, the mean of what that
-policy did with it in other futures. What that costs, at equal expected service and in the same futures, is the worth of
-deciding later.
+policy did with it in other futures; of the rest the margin is set anew, so that expected service is what is demanded.
+What that costs, in the same futures, is the worth of deciding later.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from benchmarks.foresight import RESULTS, proof
+from benchmarks.foresight import CONTENDERS, RESULTS, calibration_of, proof
 from benchmarks.uncertain import DEMANDED, WORLDS, contenders
 from benchmarks.uncertain import RESULTS as KNOBS
 from cirl_marl import MultiAgentVectorEnv
@@ -84,43 +84,55 @@ def decisions(name: str, groups: Mapping[str, Sequence[str]]) -> Iterator[str]:
     world = next(world for world in WORLDS if world.network == name)
     found, _ = proof(world, Sampling(draws=200, fit_draws=64, numbers=False))
     network, seed = found.network, found.sampling.seed
-    knob = json.loads(RESULTS.read_text())[name]["contenders"]["price_policy"]["knob"]
+    kept = json.loads(RESULTS.read_text())[name]["contenders"]
+    knob, blind_knob = kept["price_policy"]["knob"], kept["best_schedule"]["knob"]
     plan_knob = json.loads(KNOBS.read_text())[name]["contenders"]["plan"]["knob"]
 
-    def looking() -> MPC:
-        return MPC(min_service=DEMANDED, prices=found.prices, margin=knob)
+    def looking(margin: float = 1.0) -> MPC:
+        return MPC(min_service=DEMANDED, prices=found.prices, margin=knob * margin)
 
-    def losses(controller: Controller) -> Floats:
+    def outcome(controller: Controller) -> tuple[Floats, float]:
         run = rollout(MultiAgentVectorEnv(network, num_envs=DRAWS), controller, seed=first_seed(seed))
-        return found.scale * found.gaps(run.episode_circularity, run.episode_levels)
+        loss = found.scale * found.gaps(run.episode_circularity, run.episode_levels)
+        return loss, float(run.episode_levels.mean(axis=0).min())
 
     env, watched = MultiAgentVectorEnv(network, num_envs=EARLIER_DRAWS), Watched(looking())
     rollout(env, watched, seed=first_seed(seed + 1))
     actions = np.array(watched.actions)
     means, spread = (env.unstack(part.T) for part in (actions.mean(axis=2), actions.std(axis=2)))
-    levers, least = levers_of(network, groups), losses(looking())
+    levers, (least, service) = levers_of(network, groups), outcome(looking())
 
-    def regret(controller: Controller) -> Aggregate:
-        return over_episodes((losses(controller) - least) / 1e3)
+    def regret(controller: Controller) -> tuple[Aggregate, float]:
+        loss, level = outcome(controller)
+        return over_episodes((loss - least) / 1e3), level
 
-    settled = {lever: regret(Settled(looking(), agents, actions.mean(axis=2))) for lever, agents in levers.items()}
+    def without(agents: Sequence[str]) -> tuple[Aggregate, float]:
+        def settled(margin: float) -> Controller:
+            return Settled(looking(margin), agents, actions.mean(axis=2))
+
+        return regret(settled(calibration_of(network, settled, EARLIER_DRAWS).margin))
+
+    costs = {lever: without(agents) for lever, agents in levers.items()}
     first, last = slice(0, YEARS), slice(-YEARS, None)
-    yield "| lever, in % of its range | first five years | last five | spread | settled now, Mt/a |"
-    yield "|-|-|-|-|-|"
-    for lever in sorted(levers, key=lambda lever: -settled[lever].value):
+    yield "| lever, in % of its range | first five years | last five | spread | settled now, Mt/a | lowest service |"
+    yield "|-|-|-|-|-|-|"
+    for lever in sorted(levers, key=lambda lever: -costs[lever][0].value):
         shares = [
             50 * np.mean([part[agent][years] + offset for agent in levers[lever]])
             for part, years, offset in ((means, first, 1.0), (means, last, 1.0), (spread, slice(None), 0.0))
         ]
-        yield f"| {lever} | {' | '.join(f'{share:.0f}' for share in shares)} | {_interval(settled[lever])} |"
-    everything = regret(Settled(looking(), network.agents, actions.mean(axis=2)))
-    plan = regret(contenders(world, network)["plan"](plan_knob))
-    yield f"| all of them | | | | {_interval(everything)} |"
-    yield f"| the plan for what is expected | | | | {_interval(plan)} |"
+        yield f"| {lever} | {' | '.join(f'{share:.0f}' for share in shares)} | {_cells(*costs[lever])} |"
+    blind = CONTENDERS["best_schedule"](world, found)(margin=blind_knob)
+    yield f"| all of them, by the best schedule | | | | {_cells(*regret(blind))} |"
+    plan = contenders(world, network)["plan"](plan_knob)
+    yield f"| all of them, by the plan for what is expected | | | | {_cells(*regret(plan))} |"
     yield ""
-    loss = over_episodes(least / 1e3)
-    yield f"Means of {DRAWS} futures, 95 % intervals. Who looks every year is {_interval(loss)} Mt/a from the bound."
+    loss, level = _cells(over_episodes(least / 1e3), service).split(" | ")
+    yield (
+        f"Means of {DRAWS} futures, 95 % intervals. Who looks every year is {loss} Mt/a from the bound, at a "
+        f"service of {level}."
+    )
 
 
-def _interval(figure: Aggregate) -> str:
-    return f"{figure.value:+.2f} ± {(figure.high - figure.low) / 2:.2f}"
+def _cells(figure: Aggregate, level: float) -> str:
+    return f"{figure.value:+.2f} ± {(figure.high - figure.low) / 2:.2f} | {level:.4f}"

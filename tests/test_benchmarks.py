@@ -16,6 +16,7 @@ from test_uncertain_bound import works
 
 from benchmarks import foresight, paper, study, uncertain
 from cirl_marl import MultiAgentVectorEnv, load_network
+from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.lqr import LinearSystem
 from cirl_marl.controllers.rollout import first_seed, rollout
 from cirl_marl.jobs import run_jobs
@@ -94,10 +95,13 @@ def test_rows_of_the_paper_are_planned_once_and_failures_are_told(
     assert paper.DOCUMENT.read_bytes() == published
 
 
-@pytest.mark.parametrize("benchmark", [uncertain, foresight], ids=lambda module: module.RESULTS.stem)
-def test_tables_of_worlds_are_those_of_kept_results(benchmark: ModuleType) -> None:
+@pytest.mark.parametrize(
+    ("benchmark", "name"),
+    [(uncertain, "table"), (foresight, "table"), (foresight, "information_table"), (foresight, "sight_table")],
+)
+def test_tables_of_worlds_are_those_of_kept_results(benchmark: ModuleType, name: str) -> None:
     """The figures in the document are what was measured, row by row."""
-    table = benchmark.table(json.loads(benchmark.RESULTS.read_text()))
+    table = getattr(benchmark, name)(json.loads(benchmark.RESULTS.read_text()))
     rows = [line for line in table.splitlines() if line.startswith("|")]
     assert len(rows) > 2 and "\n".join(rows) in benchmark.DOCUMENT.read_text(encoding="utf-8")
 
@@ -106,6 +110,7 @@ def test_bounds_of_worlds_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     """With all that gaps and the price policy need; of another question there is none."""
     world, sampling = uncertain.World("works", "", ()), Sampling(draws=10, fit_draws=4, numbers=False)
     monkeypatch.setattr(foresight, "BOUNDS", tmp_path / "bounds")
+    monkeypatch.setattr(foresight, "RUNS", tmp_path / "runs")
     monkeypatch.setattr(foresight, "DEMANDED", 0.8)
     monkeypatch.setattr(foresight, "load_network", lambda name: replace(works(2), scenario_name=""))
     found, seconds = foresight.proof(world, sampling)
@@ -119,6 +124,19 @@ def test_bounds_of_worlds_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     )
     with pytest.raises(TypeError):
         foresight.proof(world, replace(sampling, seed=1))
+
+
+@pytest.mark.parametrize("world", uncertain.WORLDS[4:], ids=lambda world: world.network)
+def test_who_sees_more_or_less_meets_the_same_world(world: uncertain.World) -> None:
+    """What is seen differs, what happens does not."""
+    network = load_network(world.network).scenario(world.scenario)
+    envs = {sight: MultiAgentVectorEnv(foresight.seen_by(network, sight), num_envs=2) for sight in foresight.SIGHT}
+    first = rollout(envs["local"], Neutral(), seed=7).circularity
+    for sight, env in envs.items():
+        assert (rollout(env, Neutral(), seed=7).circularity == first).all(), sight
+    widths = {sight: sum(space.shape[0] for space in env.observation_spaces.values()) for sight, env in envs.items()}
+    assert widths["never"] < widths["local"] == widths["late"] < widths["forecasts of 1"] < widths["of 4"]
+    assert widths["local"] < widths["neighbours"] <= widths["all stocks"]
 
 
 def outcomes(found: UncertainBound, make: foresight.Maker) -> tuple[Any, Any]:

@@ -240,6 +240,25 @@ def test_plan_and_compare(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     ]
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--controllers", "mcp"], "unknown control 'mcp'. Did you mean 'mpc'"),
+        (["--controllers", "mpc", "--futures", "3"], "futures 3: only scenario_mpc plans for them"),
+        (["--episodes", "8"], "--bound-draws 20 is the number of episodes: leave out --episodes 8"),
+        (["--tune", "4", "--min-service", "0.9"], "tune 4: too few draws"),
+    ],
+)
+def test_what_cannot_be_compared_waits_for_no_bound(
+    arguments: list[str], message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A bound of draws takes minutes."""
+    monkeypatch.setattr("cirl_marl.optimum.bound", None)
+    place = ("--network", "car_batteries", "--scenario", "adoption", "--bound-draws", "20")
+    assert run(monkeypatch, "compare", *place, *arguments) == 2
+    assert message in " ".join(capsys.readouterr().err.split())
+
+
 @pytest.mark.medium
 def test_pareto(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Both fronts are printed, tabulated and drawn in one picture; the runs stay."""

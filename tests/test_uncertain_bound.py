@@ -420,8 +420,10 @@ def uncertain_network(make_network: Callable[..., Network], seed: int) -> Networ
     kinds = {name: kind for name, kind in KINDS.items() if kind.ends[0] > 0}
     network = replace(network, disturbances=kinds, correlation=CORRELATION, scenarios={})
     paths = [f"arcs.{arc.id}.{name}" for arc in network.arcs for name in ("rate", "flow", "share")]
-    paths += [f"nodes.{node.id}.rate" for node in network.nodes]
-    for path in rng.permutation(paths).tolist()[:6]:
+    paths += [f"arcs.{arc.id}.control.high" for arc in network.arcs if arc.control is not None]
+    paths += [f"nodes.{node.id}.{name}" for node in network.nodes for name in ("rate", "stretch")]
+    paths += [f"services.{service.id}.low" for service in network.services]
+    for path in rng.permutation(paths).tolist()[:8]:
         effect = DisturbanceEffect(by=str(rng.choice([*kinds])))
         numbers = {path: Spread(low=0.8, high=1.1, distribution="uniform")} if rng.random() < 0.3 else {}
         try:
@@ -529,6 +531,11 @@ def test_no_policy_exceeds_it(
             continue
         attacked += 1
         policies: list[Controller] = [Neutral(), Random(), MPC(min_service=demand)]
+        weight = 1.0 if demand is None else None
+        policies += [
+            MPC(min_service=demand, service_weight=weight, prices=found.prices),
+            MPC(min_service=demand, service_weight=weight, futures=2),
+        ]
         agents, rng = network.agents, np.random.default_rng(seed)
         policies += [Constant({agent: float(rng.uniform(-1, 1)) for agent in agents}) for _ in range(8)]
         policies += [Constant({agent: float(rng.choice([-1, 1])) for agent in agents}) for _ in range(8)]
@@ -539,6 +546,28 @@ def test_no_policy_exceeds_it(
             excess = merit - found.values
             assert excess.mean() <= 4 * excess.std(ddof=1) / np.sqrt(len(excess)) + size, (seed, policy)
     assert attacked >= 20
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize(("draws_made", "covered"), [(12, 0.88), (64, 0.93)])
+def test_the_interval_covers_what_it_says(draws_made: int, covered: float) -> None:
+    """Whoever draws anew has an upper end above the best policy, the extensive form, about as often as is said."""
+    network = works(4)
+    paths = Paths.of(network)
+    best = paths.best(DEMAND)[0]
+    rng = np.random.default_rng(3)
+    fitted_to = rng.choice(len(paths.chance), 32, p=paths.chance)
+    _, prices = fit_prices([paths.programs[i] for i in fitted_to], np.array([DEMAND]), 1.0)
+    values = np.array([program.prove(program.with_prices(prices)).value for program in paths.programs])
+    luck = np.array([prices.luck(program.draw.new) for program in paths.programs])
+    # about what is proved on average, which no policy exceeds, so that nothing but the interval counts
+    proved = paths.chance @ values
+    assert proved >= best - 1e-8
+    drawn = rng.choice(len(paths.chance), (2000, draws_made), p=paths.chance)
+    samples = (SimpleNamespace(values=values[row], luck=luck[row]) for row in drawn)
+    half_width = vars(uncertain_bound.UncertainBound)["half_width"].fget
+    ends = [float((sample.values - sample.luck).mean()) + half_width(sample) for sample in samples]
+    assert covered <= np.mean(np.array(ends) >= proved) <= 0.99
 
 
 def small_bound(**options: Any) -> Any:
@@ -596,6 +625,39 @@ def test_a_dropped_draw_is_an_error(found: Any, monkeypatch: pytest.MonkeyPatch)
         small_bound()
 
 
+@pytest.mark.medium
+@pytest.mark.parametrize("start", [None, 1])
+def test_prices_are_fitted_where_hardly_anything_happens(start: int | None) -> None:
+    """What differs between draws by rounding alone has no price; a bound needs draws in which something happens."""
+    network = works(4, Markov(values=(1.0, 0.3), lengths=(60, 5), start=start))
+    for seed in range(4):
+        sampling = Sampling(draws=200, fit_draws=8, seed=seed)
+        found = bound(network, min_service=DEMAND, degree=1, uncertain=sampling)
+        assert np.abs(found.prices.stock).max() < 10 and found.half_width < 0.2
+    if start is not None:
+        with pytest.raises(CirlError, match=r"10 of 10 draws meet the same disturbances.* take some 60 draws"):
+            bound(network, degree=1, uncertain=Sampling(draws=10, fit_draws=8))
+
+
+def test_a_single_decision_has_a_bound() -> None:
+    """Nothing is new after it, so that it is perfect information's."""
+    found = bound(works(3), horizon=1, min_service=0.5, degree=1, uncertain=Sampling(draws=40, fit_draws=8))
+    assert found.value == pytest.approx(found.perfect_information, abs=1e-9)
+
+
+@pytest.mark.medium
+def test_gaps_are_of_draws(found: Any) -> None:
+    """Episodes beyond the draws, and levels of other services, are refused by their shape."""
+    for circularity, levels in ((np.zeros(13), np.ones((13, 1))), (np.zeros(4), np.ones(4)), (0.0, [[1.0]])):
+        with pytest.raises(CirlError, match=r"expected \(draws,\), at most 12 draws, and \(draws, 1\)"):
+            found.gaps(circularity, levels)
+    figures = found.as_dict()
+    assert figures["value"] == found.value and figures["service_prices"] == {"served": found.prices.service[0]}
+    foresight_gap = 0.5
+    closed = found.closure(foresight_gap) * foresight_gap * found.scale
+    assert closed == pytest.approx(found.perfect_information - found.value, abs=1e-12)
+
+
 @pytest.mark.slow
 def test_jobs_prove_the_same(found: Any, tmp_path: Path) -> None:
     """In processes of their own, and what is there already is not done again."""
@@ -626,6 +688,11 @@ def test_hidden_numbers_are_told() -> None:
         (works(3), {"uncertain": Sampling(draws=9)}, "draws 9: too few for an interval, at least 10"),
         (works(3), {"uncertain": Sampling(fit_draws=1)}, "fit_draws 1: too few"),
         (works(3), {"uncertain": True, "service_weight": 0.5}, "certain future"),
+        (works(3), {"uncertain": 20}, "uncertain must be True, False or a Sampling, got 20"),
+        (works(3), {"uncertain": Sampling(draws=10.5)}, "draws must be a whole number of at least 1, got 10.5"),  # type: ignore[arg-type]
+        (works(3), {"uncertain": Sampling(numbers="no")}, "numbers must be True or False, got 'no'"),  # type: ignore[arg-type]
+        (works(3), {"uncertain": Sampling(directory=4)}, "directory must be a path, got 4"),  # type: ignore[arg-type]
+        (works(3), {"uncertain": True, "min_service": "x"}, r"min_service 'x' must lie in \[0, 1\]"),
         (works(3), {"uncertain": Sampling(on="slurm")}, "needs a directory"),
         (works(3), {"uncertain": Sampling(on="nowhere")}, "nowhere"),
         (load_network("copper_net"), {"uncertain": True}, "nothing disturbs it"),

@@ -22,7 +22,7 @@ from cirl_marl.evaluation import calibration
 from cirl_marl.evaluation.calibration import calibrate
 from cirl_marl.network.disturbances import DisturbanceEffect, Markov
 from cirl_marl.network.processes import DisturbanceProcesses
-from cirl_marl.network.uncertainty import expected_network
+from cirl_marl.network.uncertainty import Spread, expected_network
 from cirl_marl.optimum import NoCertificate, Sampling, blind, futures, simulate_plan
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.blind import BestConstant, BestSchedule, Replay
@@ -31,7 +31,7 @@ from cirl_marl.optimum.mpc import MPC
 from cirl_marl.optimum.registry import named_controller
 from cirl_marl.optimum.schedule_ascent import ScheduleAscent, improve_schedule
 from cirl_marl.optimum.window_planner import Future
-from cirl_marl.report.tradeoffs import comparison_notes
+from cirl_marl.report.tradeoffs import comparison_notes, summary_of
 
 Floats = NDArray[np.float64]
 
@@ -342,8 +342,35 @@ def test_all_are_compared_by_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     (note,) = (note for note in comparison_notes(comparison) if note.startswith("processor time of a decision"))
     noticeable = {row.name for row in comparison.rows if row.entries[0].milliseconds >= 1}
     assert {"scenario_mpc", "price_policy"} <= noticeable == {name for name in gaps if f"{name} " in note}
+    assert any(note.startswith("prices on what is new, in place of") for note in comparison_notes(comparison))
+    assert summary_of(comparison)["uncertain_bound"] == found.as_dict()
     with pytest.raises(CirlError, match="tune: give min_service"):
         compare((), names[:1], network=found.network, bounds=False, tune=10)
+
+
+@pytest.mark.medium
+def test_a_bound_goes_with_its_own_episodes() -> None:
+    """It says what is demanded and drawn; of another process, number or demand it is refused, of another sight not."""
+    numbers = {"arcs.lose.rate": Spread(low=0.5, high=1.5, distribution="uniform")}
+    network = replace(works(2), uncertain=numbers)
+    found = bound(network, min_service=0.8, degree=1, uncertain=Sampling(draws=10, fit_draws=4))
+    (process,) = network.disturbances.values()
+    unseen = replace(network, disturbances={"outage": replace(process, observed="none")})
+    (entry,) = compare((), ("neutral",), network=unseen, bounds=False, uncertain_bound=found).entries
+    assert entry.expected_gap is not None
+    planned = compare((), ("mpc",), network=network, bounds=False, uncertain_bound=found)
+    assert planned.demand is not None and planned.demand.tolist() == [0.8]
+    others: list[tuple[Network, dict[str, Any], str]] = [
+        (replace(network, disturbances={"outage": replace(process, values=(1.0, 0.2))}), {}, "the definition of"),
+        (replace(network, uncertain={"arcs.lose.rate": replace(numbers["arcs.lose.rate"], high=2.0)}), {}, "lose.rate"),
+        (network, {"min_service": 0.9}, "service of 0.9 demanded, not 0.8"),
+        (network, {"uncertain": False}, "uncertain numbers not drawn, there drawn"),
+        (network, {"episodes": 4}, r"leave out episodes \(4\)"),
+        (network, {"futures": 3}, "futures 3: only scenario_mpc plans for them"),
+    ]
+    for other, options, message in others:
+        with pytest.raises(CirlError, match=message):
+            compare((), ("neutral",), network=other, bounds=False, uncertain_bound=found, **options)
 
 
 @pytest.mark.parametrize(

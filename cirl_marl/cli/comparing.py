@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from cirl_marl.cli import common
 from cirl_marl.errors import CirlError
 from cirl_marl.jobs import PLACES
-
-if TYPE_CHECKING:
-    from cirl_marl.optimum import UncertainBound
 
 
 @common.app.command(rich_help_panel=common.COMPARISONS)
@@ -58,8 +55,12 @@ def compare(
     Nobody sees what is to come: mpc plans for what is expected from the present on, scenario_mpc for drawn futures,
     price_policy one interval ahead by the prices of --bound-draws; best_constant and best_schedule do not look at all.
     """
+    from cirl_marl.definitions.catalogue import load_network
     from cirl_marl.evaluation import compare as compared
     from cirl_marl.evaluation.calibration import check_tuning
+    from cirl_marl.evaluation.contenders import contenders
+    from cirl_marl.learners.run_directory import RunDirectory
+    from cirl_marl.optimum import Sampling, bound
     from cirl_marl.report.tradeoffs import comparison_notes, comparison_table, worst_table, write_comparison
 
     names = common.comma_separated(controllers)
@@ -71,10 +72,17 @@ def compare(
     expected = None
     if bound_draws is None:
         options["episodes"] = _enough(16, network, scenario, runs or []) if episodes is None else episodes
-    elif network is None or episodes is not None:
-        raise CirlError("--bound-draws goes with --network, and is the number of episodes: leave out --episodes")
+    elif network is None:
+        raise CirlError(f"--bound-draws {bound_draws} goes with --network")
+    elif episodes is not None:
+        raise CirlError(f"--bound-draws {bound_draws} is the number of episodes: leave out --episodes {episodes}")
     else:
-        expected = _bound(bound_draws, network, scenario, seed, min_service, uncertain)
+        definition = load_network(network, scenario=scenario)
+        # what cannot be compared is refused before the bound is computed, on which price_policy waits
+        directories, known = [RunDirectory(run) for run in runs or ()], [n for n in names if n != "price_policy"]
+        contenders(directories, known, definition, min_service, uncertain, futures=futures)
+        sampling = Sampling(draws=bound_draws, seed=seed, numbers=bool(uncertain))
+        expected = bound(definition, min_service=min_service, degree=1, uncertain=sampling)
     with common.shares() as progress:
         place: dict[str, Any] = {"network": network, "scenario": scenario, "progress": progress}
         comparison = compared(runs or [], names, uncertain_bound=expected, **place, **options)
@@ -87,16 +95,6 @@ def compare(
     files = [] if folder is None else write_comparison(comparison, folder, **options)
     for path in [*files, *common.browser_report(page, comparison)]:
         common.say(f"wrote {path}")
-
-
-def _bound(
-    draws: int, network: str, scenario: str | None, seed: int, min_service: float | None, uncertain: bool | None
-) -> UncertainBound:
-    """Return the bound for who does not foresee, on as many draws."""
-    from cirl_marl.optimum import Sampling, bound
-
-    sampling = Sampling(draws=draws, seed=seed, numbers=bool(uncertain))
-    return bound(network, scenario=scenario, min_service=min_service, degree=1, uncertain=sampling)
 
 
 def _enough(certain: int, network: str | None, scenario: str | None, runs: Sequence[Path]) -> int | None:

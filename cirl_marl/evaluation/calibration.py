@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cirl_marl.controllers.basic import Controller
-from cirl_marl.controllers.rollout import rollout
+from cirl_marl.controllers.rollout import SEED_SPACING, rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError
+from cirl_marl.errors import CirlError, whole_number
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record
 
@@ -41,8 +41,10 @@ def check_tuning(draws: int, demand: ArrayLike | None) -> None:
     Raises:
         CirlError: for too few draws, or nothing that is demanded.
     """
-    if draws < FEWEST:
+    if whole_number("tune", draws, 0) < FEWEST:
         raise CirlError(f"tune {draws}: too few draws to tell an expected level, at least {FEWEST}")
+    if draws > SEED_SPACING:
+        raise CirlError(f"tune {draws}: more draws than seeds set apart for it, {SEED_SPACING:,}")
     if demand is None:
         raise CirlError("tune: give min_service, to which expected levels are tuned")
     if not np.size(demand):

@@ -17,7 +17,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, whole_number
 from cirl_marl.evaluation.baselines import Baseline, bounds_of_draws, solve_baseline
 from cirl_marl.evaluation.calibration import CLOSE, Calibration, calibrate, check_tuning
-from cirl_marl.evaluation.contenders import Contender, contenders
+from cirl_marl.evaluation.contenders import Contender, contenders, differences
 from cirl_marl.evaluation.episode_count import MOST_EPISODES, concatenation, enough_episodes, ties
 from cirl_marl.evaluation.figures import gain
 from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, SHARE, Aggregate, over_episodes, over_seeds, worst_mean
@@ -25,7 +25,7 @@ from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum import NoCertificate, gap
-from cirl_marl.optimum.options import demanded_levels
+from cirl_marl.optimum.options import demanded_levels, levels_text
 from cirl_marl.optimum.uncertain_bound import UncertainBound
 
 FIGURES = ("circularity", "gain", "service", "bound", "gap")
@@ -211,12 +211,14 @@ def compare(
             the interval of a difference between two rows is wider than that (``episode_count.ties``).
         seed: different seeds share no episode.
         min_service: mean level of every service, or of each, shape (services,), that ``registry.PLANNERS`` plan for;
-            None: as much as can be had.
+            None: what ``uncertain_bound`` is for, or else as much as can be had.
         bounds: whether to hold the episodes against the best possible.
         uncertain: whether each episode draws the uncertain numbers of the network, the same for everyone; each is then
-            held against the best possible with the numbers that it drew. None: if it was so in the training.
-        uncertain_bound: ``bound(…, uncertain=True)`` of the same network, to which entries have a gap as well: its
-            draws are the episodes, whose number and seed it sets. ``price_policy`` acts by its prices.
+            held against the best possible with the numbers that it drew. None: as in the draws of
+            ``uncertain_bound``, or else if it was so in the training.
+        uncertain_bound: ``bound(…, uncertain=True)`` of the same network, whatever is observed there, at the same
+            service, to which entries have a gap as well: its draws are the episodes, whose number and seed it sets.
+            ``price_policy`` acts by its prices.
         tune: draws of its own on which each controller that has a margin on what it aims at sets that so that the
             expected level of the service that lacks most is ``min_service``; None: the margin is 1.
         futures: that ``scenario_mpc`` plans for; None: ``registry.FUTURES``.
@@ -236,7 +238,11 @@ def compare(
     run_directories = [run if isinstance(run, RunDirectory) else RunDirectory(run) for run in runs]
     controls = controllers if "neutral" in controllers else ["neutral", *controllers]
     variant = None if definition is None else definition.scenario(scenario)
-    prices = None if uncertain_bound is None else uncertain_bound.prices
+    prices = None
+    if uncertain_bound is not None:
+        prices, numbers = uncertain_bound.prices, uncertain_bound.draws_numbers
+        min_service = uncertain_bound.min_service if min_service is None else min_service
+        uncertain = numbers if uncertain is None else uncertain
     candidates, env = contenders(
         run_directories, controls, variant, min_service, uncertain, futures=futures, prices=prices
     )
@@ -244,7 +250,8 @@ def compare(
     if tune is not None:
         check_tuning(tune, demand)
     if uncertain_bound is not None:
-        episodes, seed = _check_draws(uncertain_bound, env, episodes, seed), uncertain_bound.sampling.seed
+        _check_bound(uncertain_bound, env, demand)
+        episodes, seed = _draws_of(uncertain_bound, episodes, seed), uncertain_bound.sampling.seed
     adapts, first = episodes is None and bool(env.network.disturbed), first_seed(seed)
     episodes = enough_episodes(env.network) if episodes is None else episodes
     calibrations: list[Calibration | None] = [None] * len(candidates)
@@ -301,19 +308,32 @@ def _after(progress: ProgressReport, done: float) -> ProgressReport:
     return lambda stage, share: progress(stage, done + (1 - done) * share)
 
 
-def _check_draws(bound_: UncertainBound, env: MultiAgentVectorEnv, episodes: int | None, seed: int) -> int:
-    """Return the number of draws of a bound for who does not foresee, if they are the episodes."""
-    draws, network, sampling = len(bound_.values), bound_.network, bound_.sampling
-    parts = [(part.nodes, part.arcs, part.services, part.episode, part.disturbed) for part in (network, env.network)]
-    numbers, starts = sampling.numbers and bool(network.uncertain), bound_.initial is None
-    if parts[0] != parts[1] or bound_.agents != env.agents or numbers != env.uncertain or not starts:
+def _check_bound(bound_: UncertainBound, env: MultiAgentVectorEnv, demand: Floats | None) -> None:
+    """Refuse a bound for who does not foresee that is of something else than the episodes.
+
+    Raises:
+        CirlError: naming what differs.
+    """
+    agents, draws_numbers = bound_.agents or None, bound_.draws_numbers
+    own = MultiAgentVectorEnv(bound_.network, num_envs=1, agents=agents, uncertain=draws_numbers)
+    others = [*differences(env, own)]
+    if bound_.initial is not None:
+        others.append("starts drawn, not given")
+    asked = "nothing" if bound_.min_service is None else levels_text(bound_.network, bound_.min_service)
+    if demand is not None and (bound_.min_service is None or (bound_.min_service != demand).any()):
+        others.append(f"service of {levels_text(env.network, demand)} demanded, not {asked}")
+    if others:
+        raise CirlError(f"uncertain_bound: the episodes are of something else than the bound: {'; '.join(others)}")
+
+
+def _draws_of(bound_: UncertainBound, episodes: int | None, seed: int) -> int:
+    """Return the number of draws of a bound for who does not foresee, which are the episodes."""
+    draws, own_seed = len(bound_.values), bound_.sampling.seed
+    if episodes not in (None, draws) or seed not in (0, own_seed):
         raise CirlError(
-            f"uncertain_bound: it is of '{network.name}' with agents {list(bound_.agents)}, numbers "
-            f"{'drawn' if numbers else 'not drawn'} and starts {'drawn' if starts else 'given'}; the episodes are of "
-            f"'{env.network.name}' with {list(env.agents)}, numbers {'drawn' if env.uncertain else 'not drawn'}"
+            f"uncertain_bound: its {draws} draws of seed {own_seed} are the episodes; leave out episodes ({episodes}) "
+            f"and seed ({seed})"
         )
-    if episodes not in (None, draws) or seed not in (0, sampling.seed):
-        raise CirlError(f"uncertain_bound: its {draws} draws of seed {sampling.seed} are the episodes; leave both out")
     return draws
 
 

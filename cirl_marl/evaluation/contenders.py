@@ -57,6 +57,8 @@ def contenders(
         raise CirlError("nothing to compare in: give a training run or a network")
     if len(set(controllers)) != len(controllers):
         raise CirlError(f"controllers {list(controllers)} must be distinct")
+    if futures is not None and "scenario_mpc" not in controllers:
+        raise CirlError(f"futures {futures}: only scenario_mpc plans for them, which is not among the controllers")
     envs = [run.make_env(1, uncertain=uncertain) for run in runs]
     draws = bool(uncertain) if not envs else envs[0].uncertain
     first = envs[0] if network is None else MultiAgentVectorEnv(network, num_envs=1, uncertain=draws)
@@ -95,7 +97,7 @@ def differences(env: MultiAgentVectorEnv, reference_env: MultiAgentVectorEnv) ->
         yield f"uncertain numbers {words[0]}, there {words[1]}; say which with uncertain"
     physics, reference = _physics(own_network), _physics(reference_network)
     changes = [f"{key} {physics[key]!r}, not {reference[key]!r}" for key in physics if physics[key] != reference[key]]
-    parts, counterparts = _parts(own_network), _parts(reference_network)
+    parts, counterparts = (_parts(each.network, each.uncertain) for each in (env, reference_env))
     ids = [f"'{key[1]}'" for key in parts | counterparts if parts.get(key) != counterparts.get(key)]
     if ids:
         changes.append(f"the definition of {', '.join(ids[:5])}{' and others' if len(ids) > 5 else ''}")
@@ -116,12 +118,15 @@ def _physics(network: Network) -> dict[str, Any]:
     }
 
 
-def _parts(network: Network) -> dict[tuple[str, str], object]:
-    """Return compartments, services, which may share ids, and what disturbs numbers, by what they are and their id."""
+def _parts(network: Network, draws_numbers: bool) -> dict[tuple[str, str], object]:
+    """Return compartments, services, which may share ids, and what is uncertain, by what they are and their id."""
     parts: dict[tuple[str, str], object] = {("compartment", id_): part for id_, part in network.compartments.items()}
     parts |= {("service", service.id): service for service in network.services}
-    effects = network.disturbed.items()
-    parts |= {("disturbance", path): (effect, network.disturbances[effect.by]) for path, effect in effects}
+    seen_alike = {"observed": "now", "delayed": 0, "forecast": 0, "observed_by": ()}
+    for path, effect in network.disturbed.items():
+        parts["disturbance", path] = effect, replace(network.disturbances[effect.by], **seen_alike)
+    if draws_numbers:
+        parts |= {("number", path): spread for path, spread in network.uncertain.items()}
     return parts | {("correlation", "disturbance_correlation"): network.correlation}
 
 

@@ -230,11 +230,13 @@ def bound(
     """
     check_options(service_weight, min_service, degree)
     definition = _episode_network(network, scenario, horizon)
-    if uncertain is not False:
+    if not isinstance(uncertain, bool | np.bool_ | Sampling):
+        raise CirlError(f"uncertain must be True, False or a Sampling, got {uncertain!r}")
+    if isinstance(uncertain, Sampling) or uncertain:
         if service_weight is not None or near is not None:
             raise CirlError("uncertain: service_weight and near go with a certain future; demand min_service")
         levels = None if min_service is None else demanded_levels(definition, min_service)
-        sampling = Sampling() if uncertain is True else uncertain
+        sampling = uncertain if isinstance(uncertain, Sampling) else Sampling()
         return uncertain_bound(definition, agents, initial, levels, degree, sampling)
     admissible = Admissible.of(definition, agents)
     start = starting_stocks(admissible.lifetimes, initial)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import field, fields
+from dataclasses import field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from cirl_marl.controllers.rollout import SEED_SPACING, first_seed
 from cirl_marl.definitions.writer import fingerprint
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError
+from cirl_marl.errors import CirlError, whole_number
 from cirl_marl.jobs import JobStatus, Tell, check_place, raise_first, run_jobs
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import frozen_record, positional_record
@@ -23,8 +24,10 @@ from cirl_marl.optimum.draws import Draw, DrawProgram, Prices, draws_of
 from cirl_marl.optimum.program import circularity_weights
 from cirl_marl.records.files import write_atomically
 
-FEWEST = 10
-"""Draws below which no interval is given."""
+FEWEST, FEWEST_FITTED = 10, 4
+"""Draws below which no interval is given, and to which no prices are fitted."""
+FEWEST_OTHERS = 3
+"""Draws that have to meet something else than most do: with fewer, Student's interval is far too narrow."""
 CHUNK = 8
 """Draws of a job."""
 
@@ -44,22 +47,52 @@ class Sampling:
     on: Annotated[str, "``here``, ``local``, ``slurm`` or ``ray``, see ``jobs.run_jobs``"] = "here"
     workers: Annotated[int | None, "how many work at a time; None is all that the place has"] = None
     settings: Annotated[Mapping[str, str], "of ``sbatch``, for ``slurm``"] = field(default_factory=dict)
-    directory: Annotated[Path | None, "where what is done is kept, for machines that share it; None: nowhere"] = None
+    directory: Annotated[str | Path | None, "where what is done is kept, for machines that share it; None: nowhere"] = (
+        None
+    )
 
-    def check(self) -> None:
-        """Refuse what cannot be.
+    def checked(self) -> Sampling:
+        """Return it with numbers of Python and a path of pathlib.
 
         Raises:
-            CirlError: for too few draws, or a place that cannot be used.
+            CirlError: for what is no number, too few draws, or a place that cannot be used.
         """
-        for name, least in (("draws", FEWEST), ("fit_draws", 4)):
-            if getattr(self, name) < least:
-                raise CirlError(f"{name} {getattr(self, name)}: too few for an interval, at least {least}")
-        if max(self.draws, self.fit_draws) > SEED_SPACING // 2:
-            raise CirlError(f"draws and fit_draws must be at most {SEED_SPACING // 2:,}")
+        draws, fit_draws = whole_number("draws", self.draws, 1), whole_number("fit_draws", self.fit_draws, 1)
+        for name, count, least in (("draws", draws, FEWEST), ("fit_draws", fit_draws, FEWEST_FITTED)):
+            if count < least:
+                raise CirlError(f"{name} {count}: too few for an interval, at least {least}")
+            if count > SEED_SPACING // 2:
+                raise CirlError(f"{name} {count}: at most {SEED_SPACING // 2:,}")
+        if not isinstance(self.numbers, bool):
+            raise CirlError(f"numbers must be True or False, got {self.numbers!r}")
+        if not isinstance(self.settings, Mapping):
+            raise CirlError(f"settings must be a mapping of options of sbatch to values, got {self.settings!r}")
         check_place(self.on, self.workers, self.settings)
         if self.on == "slurm" and self.directory is None:
             raise CirlError("on 'slurm' needs a directory that all machines share")
+        if not isinstance(self.directory, str | Path | None):
+            raise CirlError(f"directory must be a path, got {self.directory!r}")
+        seed, directory = whole_number("seed", self.seed, 0), None if self.directory is None else Path(self.directory)
+        return replace(self, draws=draws, fit_draws=fit_draws, seed=seed, directory=directory)
+
+    def check_paths(self, network: Network) -> None:
+        """Refuse draws nearly all of which meet the same: no interval is known of what hardly ever happens.
+
+        Raises:
+            CirlError: with about how many draws would do.
+        """
+        if not network.disturbed or (self.numbers and network.uncertain):
+            return
+        first = first_seed(self.seed)
+        paths = network.processes.sample(range(first, first + self.draws)).values
+        counts = np.unique(paths.reshape(-1, self.draws), axis=1, return_counts=True)[1]
+        others = self.draws - int(counts.max())
+        if others < FEWEST_OTHERS:
+            enough = math.ceil(2 * FEWEST_OTHERS * self.draws / max(others, 1))
+            raise CirlError(
+                f"network '{network.name}': {self.draws - others} of {self.draws} draws meet the same disturbances, so "
+                f"that the others are too few for an interval; take some {enough:,} draws"
+            )
 
 
 def draw(
@@ -93,7 +126,7 @@ def prove_draws(
 ) -> Proofs:
     """Prove a bound of every draw under some prices, none of them left out."""
     with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary) if sampling.directory is None else sampling.directory
+        folder = Path(temporary if sampling.directory is None else sampling.directory)
         first = first_seed(sampling.seed)
         digest = _digest(network, agents, initial, degree, sampling.numbers, prices)
         jobs = [

@@ -89,7 +89,7 @@ def check_service(min_service: ArrayLike) -> None:
         CirlError: naming the first of them.
     """
     for level in np.ravel(min_service).tolist():
-        if not 0 <= level <= 1:
+        if not isinstance(level, int | float) or not 0 <= level <= 1:
             raise CirlError(f"min_service {level!r} must lie in [0, 1]")
 
 

@@ -33,6 +33,8 @@ RIDGE = 1e-3
 """Penalty on the coefficients of the regression, relative to the variance of what they multiply."""
 SHOCK_RIDGE = 0.3
 """The same for what shocks add to draws, of which there are few."""
+ROUNDING = 1e-9
+"""Relative deviation from the mean up to which something is taken not to have differed between the draws."""
 WORTHWHILE = 0.1
 """Share of the fall that the cuts promise, at which a step is taken."""
 FIRST_RADIUS = 0.5
@@ -79,9 +81,8 @@ class Sample:
         """Return what is to be expected of stocks under the plans of a trial: ``reference`` and ``response``."""
         stocks = np.array([program.stocks(plan) for program, plan, _ in self._optima(trial)])
         past = np.array([past_of(program.draw.features) for program in self.programs])
-        mean = past.mean(axis=0)
-        response = _regression((past - mean).reshape(-1, past.shape[2]), stocks - stocks.mean(axis=0))
-        return stocks.mean(axis=0) - mean @ response, response
+        response = _regression(_deviations(past).reshape(-1, past.shape[2]), stocks - stocks.mean(axis=0))
+        return stocks.mean(axis=0) - past.mean(axis=0) @ response, response
 
     def levels(self, trial: PriceTrial) -> Floats:
         """Return the levels of each draw, shape (draws, services)."""
@@ -105,9 +106,10 @@ class Sample:
         """
         worth = np.array([program.stock_values(certificate) for program, _, certificate in self._optima(trial)])
         features = np.array([program.draw.features[1:] for program in self.programs])
-        size, deviation = np.sqrt((worth**2).mean(axis=(0, 1))), features.std(axis=(0, 1))
+        around = _deviations(features.reshape(1, -1, features.shape[2]), axis=1)
+        size, deviation = np.sqrt((worth**2).mean(axis=(0, 1))), np.sqrt((around**2).mean(axis=(0, 1)))
         scales = np.divide(size[:, None], deviation, out=np.zeros((len(size), len(deviation))), where=deviation > 0)
-        worth, features = worth - worth.mean(axis=0), features - features.mean(axis=0)
+        worth, features = worth - worth.mean(axis=0), _deviations(features)
         knots = knot_weights(worth.shape[1], len(trial.prices.stock))
         shape = len(trial.prices.stock), features.shape[2]
         table = np.einsum("itf,tk->itkf", features, knots).reshape(-1, shape[0] * shape[1])
@@ -162,7 +164,7 @@ def fit_prices(
         _check_reach(sample, trial, scale)
     progress(0.3)
     clairvoyant, trials = trial.prices, [trial]
-    if functions:
+    if functions and steps:
         # while nothing is charged, the stocks from which it counts do not matter
         reference, response = sample.reference(trial)
         trial = replace(trial, prices=replace(clairvoyant, reference=reference, response=response))
@@ -280,9 +282,16 @@ class _Cuts:
         return solution.x[:size], float(solution.fun)
 
 
+def _deviations(samples: Floats, axis: int = 0) -> Floats:
+    """Return samples, shape (draws, steps, functions), less their mean; what differs by rounding alone is 0."""
+    apart: Floats = samples - samples.mean(axis=axis, keepdims=True)
+    apart[..., np.abs(apart).max(axis=(0, 1)) <= ROUNDING * np.abs(samples).max(axis=(0, 1))] = 0.0
+    return apart
+
+
 def _regression(table: Floats, target: Floats, ridge: float = RIDGE) -> Floats:
     """Return the coefficients of the columns of a table by ridge regression, (columns, …); of those that are 0 none."""
-    size = table.std(axis=0)
+    size = np.sqrt((table**2).mean(axis=0))
     table = np.divide(table, size, out=np.zeros_like(table), where=size > 0)
     normal = table.T @ table + ridge * len(table) * np.eye(table.shape[1])
     solution = np.linalg.solve(normal, table.T @ target.reshape(len(table), -1))

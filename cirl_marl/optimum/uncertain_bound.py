@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -83,9 +84,14 @@ class UncertainBound:
         return abs(self.value) if abs(self.value) >= NEAR_ZERO * gross_mass else gross_mass
 
     @property
+    def draws_numbers(self) -> bool:
+        """Whether uncertain numbers are drawn, too."""
+        return self.sampling.numbers and bool(self.network.uncertain)
+
+    @property
     def hidden_numbers(self) -> tuple[str, ...]:
         """Numbers drawn once per episode, which the bound knows from the start and a policy does not."""
-        return tuple(self.network.uncertain) if self.sampling.numbers else ()
+        return tuple(self.network.uncertain) if self.draws_numbers else ()
 
     def gaps(self, circularity: ArrayLike, levels: ArrayLike, *, with_foresight: bool = False) -> Floats:
         """Return (bound − λ̄ − Σ_s μ_s (level_s − demand_s))/scale of each draw under a policy; its gap is their mean.
@@ -94,17 +100,36 @@ class UncertainBound:
             circularity: λ̄ of the episodes, shape (draws,), or (any,) of the first draws.
             levels: mean level of each service, shape (draws, services).
             with_foresight: whether it is held against who knows the future instead.
+
+        Raises:
+            CirlError: for other shapes.
         """
         prices, values = (self.informed_prices, self.informed_values) if with_foresight else (self.prices, self.values)
+        count, services = np.size(circularity), len(self.network.services)
+        if np.shape(circularity) != (count,) or count > len(values) or np.shape(levels) != (count, services):
+            raise CirlError(
+                f"gaps: circularity of shape {np.shape(circularity)} and levels of shape {np.shape(levels)}; expected "
+                f"(draws,), at most {len(values)} draws, and (draws, {services})"
+            )
         merit = np.asarray(circularity, dtype=float) + prices.service_value(np.asarray(levels, dtype=float))
         return np.asarray((values[: len(merit)] - merit) / self.scale)
 
-    def closure(self, merit: float) -> float:
-        """Return the share of the distance between perfect information and a policy that the penalty closes.
+    def closure(self, foresight_gap: float) -> float:
+        """Return the share of a policy's mean gap to who knows the future that the prices close; NaN if it is 0."""
+        closed = (self.perfect_information - self.value) / self.scale
+        return closed / foresight_gap if foresight_gap else math.nan
 
-        ``merit`` is the policy's mean of λ̄ + Σ_s μ_s (level_s − demand_s), with the prices of who knows the future.
-        """
-        return (self.perfect_information - self.value) / (self.perfect_information - merit)
+    def as_dict(self) -> dict[str, Any]:
+        """Return its figures, ready for JSON."""
+        ids = [service.id for service in self.network.services]
+        names = ("value", "upper", "perfect_information", "scale", "failures")
+        return {name: getattr(self, name) for name in names} | {
+            "draws": len(self.values),
+            "fit_draws": self.sampling.fit_draws,
+            "seed": self.sampling.seed,
+            "draws_numbers": self.draws_numbers,
+            "service_prices": dict(zip(ids, self.prices.service.tolist(), strict=True)),
+        }
 
     def verify(self) -> float:
         """Draw everything again, compute what the multipliers prove of each draw, and return the mean, mass."""
@@ -149,9 +174,10 @@ def uncertain_bound(
         CirlError: if nothing is uncertain, the program of a draw is too large, or services are out of reach.
         NoCertificate: for a network whose flows are not linear laws.
     """
-    sampling.check()
+    sampling = sampling.checked()
     if not network.disturbed and not (network.uncertain and sampling.numbers):
         raise CirlError(f"network '{network.name}': nothing disturbs it and no number is drawn; leave out uncertain")
+    sampling.check_paths(network)
     first, actors = first_seed(sampling.seed), MultiAgentVectorEnv(network, num_envs=1, agents=agents).agents
     start = None if initial is None else starting_stocks(Lifetimes(network, actors), initial)
     futures = draw(network, agents, start, sampling.numbers, first + SEED_SPACING // 2, sampling.fit_draws)

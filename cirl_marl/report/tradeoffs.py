@@ -102,6 +102,11 @@ def comparison_notes(comparison: Comparison) -> list[str]:
         notes.append(f"processor time of a decision: {', '.join(slow)}; of others less than 1 ms")
     if (expected := comparison.entries[0].uncertain_bound) is not None:
         notes += [str(expected), "gaps: (bound − λ̄ − Σ μ·(service − demand)) of each draw over one scale"]
+        gaps = {row.name: figure.value for row in comparison.rows if (figure := row.figure("foresight_gap"))}
+        best = min(gaps, key=gaps.__getitem__)
+        if gaps[best] > 0:
+            share = f"{100 * expected.closure(gaps[best]):.0f} % of the gap of {best}"
+            notes.append(f"prices on what is new, in place of perfect information, close {share}")
     if comparison.entries[0].bound is not None:
         foresight = "" if baseline.envelope is not None else ", whatever anybody knew of what was drawn,"
         episode = f"episode from the same start with at least the same level of each service{foresight}"
@@ -168,6 +173,7 @@ def summary_of(comparison: Comparison, **options: Any) -> dict[str, Any]:
             else {part.name: getattr(calibration, part.name) for part in fields(calibration)}
         )
         rows.append({"name": row.name, "seeds": list(row.seeds), **plain})
+    expected = comparison.entries[0].uncertain_bound
     return {
         "provenance": provenance(comparison.network, runs, **options),
         "unit": comparison.network.mass_unit,
@@ -176,6 +182,7 @@ def summary_of(comparison: Comparison, **options: Any) -> dict[str, Any]:
         "ties": None if comparison.ties is None else list(comparison.ties),
         "first_seed": comparison.first_seed,
         "no_bound": comparison.baseline.reason or None,
+        "uncertain_bound": None if expected is None else expected.as_dict(),
         "front": [{"service": level, "bound": bound} for level, bound in comparison.baseline.front.tolist()],
         "rows": rows,
     }
