@@ -247,6 +247,7 @@ def test_plan_and_compare(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
         (["--controllers", "mpc", "--futures", "3"], "futures 3: only scenario_mpc plans for them"),
         (["--episodes", "8"], "--bound-draws 20 is the number of episodes: leave out --episodes 8"),
         (["--tune", "4", "--min-service", "0.9"], "tune 4: too few draws"),
+        (["--network", "carbo_net"], "network 'carbo_net': unknown scenario 'adoption'"),
     ],
 )
 def test_what_cannot_be_compared_waits_for_no_bound(

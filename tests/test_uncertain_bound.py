@@ -646,6 +646,14 @@ def test_a_single_decision_has_a_bound() -> None:
 
 
 @pytest.mark.medium
+def test_rounding_of_the_solver_is_no_scale() -> None:
+    """Where nothing has to be moved, gaps are in parts of the circularity scale."""
+    network = stockist(4)
+    found = bound(network, degree=1, uncertain=Sampling(draws=10, fit_draws=4))
+    assert abs(found.value) < 1e-6 and found.scale == network.objective.circularity_scale
+
+
+@pytest.mark.medium
 def test_gaps_are_of_draws(found: Any) -> None:
     """Episodes beyond the draws, and levels of other services, are refused by their shape."""
     for circularity, levels in ((np.zeros(13), np.ones((13, 1))), (np.zeros(4), np.ones(4)), (0.0, [[1.0]])):

@@ -41,6 +41,8 @@ def compare(
     bound_draws: Annotated[
         int | None, typer.Option(help="Draws of the bound for who does not foresee, which are then the episodes.")
     ] = None,
+    on: Annotated[str, typer.Option(help="Where draws of the bound are proved: here, local or ray.")] = "here",
+    workers: Annotated[int | None, typer.Option(min=1, help="At a time; default: all that can be.")] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for episodes.csv, summary.csv, summary.json and comparison.png.")
     ] = None,
@@ -70,6 +72,8 @@ def compare(
     options: dict[str, Any] = {"seed": seed, "min_service": min_service, "uncertain": uncertain}
     options |= {"tune": tune, "futures": futures, "bounds": bounds and bound_draws is None}
     expected = None
+    if bound_draws is None and (on, workers) != ("here", None):
+        raise CirlError(f"--on {on}, --workers {workers}: only draws of --bound-draws are proved elsewhere")
     if bound_draws is None:
         options["episodes"] = _enough(16, network, scenario, runs or []) if episodes is None else episodes
     elif network is None:
@@ -81,7 +85,7 @@ def compare(
         # what cannot be compared is refused before the bound is computed, on which price_policy waits
         directories, known = [RunDirectory(run) for run in runs or ()], [n for n in names if n != "price_policy"]
         contenders(directories, known, definition, min_service, uncertain, futures=futures)
-        sampling = Sampling(draws=bound_draws, seed=seed, numbers=bool(uncertain))
+        sampling = Sampling(draws=bound_draws, seed=seed, numbers=bool(uncertain), on=on, workers=workers)
         expected = bound(definition, min_service=min_service, degree=1, uncertain=sampling)
     with common.shares() as progress:
         place: dict[str, Any] = {"network": network, "scenario": scenario, "progress": progress}

@@ -26,6 +26,8 @@ from cirl_marl.optimum.vintages import Lifetimes
 CONFIDENCE = 0.95
 NEAR_ZERO = 0.05
 """Share of the mass that λ counts, below which a bound is no measure of gaps."""
+NOTHING = 1e-6
+"""Share of the circularity scale up to which a bound is rounding of the solver."""
 
 
 @frozen_record
@@ -79,9 +81,14 @@ class UncertainBound:
 
     @property
     def scale(self) -> float:
-        """By what gaps are divided: |bound|, or the gross mass that λ counts where the bound is below 5 % of it."""
+        """By what gaps are divided: |bound|, or the gross mass that λ counts where the bound is below 5 % of it.
+
+        Where that is nothing but the tolerance of the solver, it is the circularity scale.
+        """
         gross_mass = float(np.nanmean(self.gross_mass)) if self.failures < len(self.gross_mass) else 0.0
-        return abs(self.value) if abs(self.value) >= NEAR_ZERO * gross_mass else gross_mass
+        scale = abs(self.value) if abs(self.value) >= NEAR_ZERO * gross_mass else gross_mass
+        circularity_scale = self.network.objective.circularity_scale
+        return scale if scale > NOTHING * circularity_scale else circularity_scale
 
     @property
     def draws_numbers(self) -> bool:

@@ -105,7 +105,7 @@ def comparison_notes(comparison: Comparison) -> list[str]:
         gaps = {row.name: figure.value for row in comparison.rows if (figure := row.figure("foresight_gap"))}
         best = min(gaps, key=gaps.__getitem__)
         if gaps[best] > 0:
-            share = f"{100 * expected.closure(gaps[best]):.0f} % of the gap of {best}"
+            share = f"{round(100 * expected.closure(gaps[best]))} % of the gap of {best}"
             notes.append(f"prices on what is new, in place of perfect information, close {share}")
     if comparison.entries[0].bound is not None:
         foresight = "" if baseline.envelope is not None else ", whatever anybody knew of what was drawn,"
