@@ -76,7 +76,7 @@ BY_DRAW, PRICES = (
     ("prices", "informed_prices"),
 )
 """What is kept of a bound."""
-NOTICEABLE = 0.1
+NOTICEABLE = 0.001
 """Least processor time of a decision that is told, ms."""
 Maker = Callable[..., Controller]
 
@@ -355,7 +355,7 @@ def _rows(results: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
                 _service(figures["levels"]),
                 _mass(figures["circularity"]["value"], figures["circularity"]),
                 _mass(figures["worst_circularity"]["value"], figures["worst_circularity"]),
-                f"{figures['milliseconds']:.0f}" if figures["milliseconds"] >= NOTICEABLE else "",
+                _time(figures["milliseconds"]),
                 f"{figures['draws']}",
             )
 
@@ -364,6 +364,10 @@ def _mass(value: float, interval: Mapping[str, float] | None = None) -> str:
     digits = 0 if abs(value) >= 1000 else max(0, 3 - math.floor(math.log10(max(abs(value), 1e-9))))
     doubt = "" if interval is None else f" ± {(interval['high'] - interval['low']) / 2:.{digits}f}"
     return f"{value:.{digits}f}{doubt}"
+
+
+def _time(milliseconds: float) -> str:
+    return "" if milliseconds < NOTICEABLE else f"{milliseconds:.{0 if milliseconds >= 1 else 3}f}"
 
 
 def _service(levels: Mapping[str, Mapping[str, float]]) -> str:

@@ -639,6 +639,15 @@ def test_prices_are_fitted_where_hardly_anything_happens(start: int | None) -> N
             bound(network, degree=1, uncertain=Sampling(draws=10, fit_draws=8))
 
 
+def test_rounding_is_no_deviation() -> None:
+    """What is the same in all draws has none, though its mean is rounded."""
+    samples = np.random.default_rng(0).normal(size=(7, 3, 2))
+    samples[..., 0] = 0.1
+    assert (samples.mean(axis=0)[:, 0] != 0.1).all()
+    apart = price_fit._deviations(samples)
+    assert (apart[..., 0] == 0.0).all() and (apart[..., 1] == samples[..., 1] - samples[..., 1].mean(axis=0)).all()
+
+
 def test_a_single_decision_has_a_bound() -> None:
     """Nothing is new after it, so that it is perfect information's."""
     found = bound(works(3), horizon=1, min_service=0.5, degree=1, uncertain=Sampling(draws=40, fit_draws=8))
