@@ -51,7 +51,7 @@ class Sampling:
         None
     )
 
-    def checked(self) -> Sampling:
+    def validate(self) -> Sampling:
         """Return it with numbers of Python and a path of pathlib.
 
         Raises:

@@ -181,7 +181,7 @@ def uncertain_bound(
         CirlError: if nothing is uncertain, the program of a draw is too large, or services are out of reach.
         NoCertificate: for a network whose flows are not linear laws.
     """
-    sampling = sampling.checked()
+    sampling = sampling.validate()
     if not network.disturbed and not (network.uncertain and sampling.numbers):
         raise CirlError(f"network '{network.name}': nothing disturbs it and no number is drawn; leave out uncertain")
     sampling.check_paths(network)
