@@ -97,7 +97,7 @@ def test_rows_of_the_paper_are_planned_once_and_failures_are_told(
 
 @pytest.mark.parametrize(
     ("benchmark", "name"),
-    [(uncertain, "table"), (foresight, "table"), (foresight, "sight_table")],
+    [(uncertain, "table"), (foresight, "table"), (foresight, "information_table"), (foresight, "sight_table")],
 )
 def test_tables_of_worlds_are_those_of_kept_results(benchmark: ModuleType, name: str) -> None:
     """The figures in the document are what was measured, row by row."""
