@@ -127,12 +127,15 @@ def decisions(name: str, groups: Mapping[str, Sequence[str]]) -> Iterator[str]:
     plan = contenders(world, network)["plan"](plan_knob)
     yield f"| all of them, by the plan for what is expected | | | | {_cells(*regret(plan))} |"
     yield ""
-    loss, level = _cells(over_episodes(least / 1e3), service).split(" | ")
     yield (
-        f"Means of {DRAWS} futures, 95 % intervals. Who looks every year is {loss} Mt/a from the bound, at a "
-        f"service of {level}."
+        f"Means of {DRAWS} futures, 95 % intervals. Who looks every year is {_interval(over_episodes(least / 1e3))} "
+        f"Mt/a from the bound, at a service of {service:.4f}."
     )
 
 
 def _cells(figure: Aggregate, level: float) -> str:
-    return f"{figure.value:+.2f} ± {(figure.high - figure.low) / 2:.2f} | {level:.4f}"
+    return f"{_interval(figure)} | {level:.4f}"
+
+
+def _interval(figure: Aggregate) -> str:
+    return f"{figure.value:+.2f} ± {(figure.high - figure.low) / 2:.2f}"

@@ -260,6 +260,14 @@ def test_what_cannot_be_compared_waits_for_no_bound(
     assert message in " ".join(capsys.readouterr().err.split())
 
 
+def test_only_draws_of_a_bound_are_proved_elsewhere(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without them a place is an error, not ignored."""
+    assert run(monkeypatch, "compare", "--network", "car_batteries", "--on", "local") == 2
+    assert "only draws of --bound-draws are proved elsewhere" in " ".join(capsys.readouterr().err.split())
+
+
 @pytest.mark.medium
 def test_pareto(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Both fronts are printed, tabulated and drawn in one picture; the runs stay."""

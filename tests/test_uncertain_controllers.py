@@ -317,6 +317,9 @@ def test_margins_are_set_on_draws_of_their_own() -> None:
     assert calibrate(env, lambda margin: Shifted(1.0), np.ones(1), 10).excess < -0.05
     with pytest.raises(CirlError, match="tune 3: too few draws"):
         calibrate(env, Shifted, demand, 3)
+    for draws, message in ((10.5, "tune must be a whole number"), (10**7, "more draws than seeds set apart")):
+        with pytest.raises(CirlError, match=message):
+            calibrate(env, Shifted, demand, draws)  # type: ignore[arg-type]
 
 
 @pytest.mark.medium
