@@ -122,6 +122,14 @@ def test_the_program_of_a_step_is_the_episode_to_first_order(lives: bool) -> Non
         assert not moved[len(place) :].any()
 
 
+def test_a_step_is_corrected_until_services_are_kept() -> None:
+    """What a step to first order lacks of a service is made up for by what its own episode says, in the same round."""
+    found = bound("copper_net", min_service=0.99, horizon=40, degree=1)
+    for rounds in (1, 2):
+        run = simulate_plan(improve_plan(found, rounds=rounds))
+        assert run.episode_levels.min() >= 0.99 - 1e-4
+
+
 @pytest.mark.slow
 def test_the_unit_of_mass_does_not_matter(tmp_path: Path) -> None:
     """In kg, kt and Gt: the same bound, plan, and episodes of the plan and of MPC."""

@@ -32,9 +32,9 @@ by less than the tolerance of HiGHS."""
 PENALTY = 3.0
 """What is charged for what a service lacks, times the price that the bound puts on it. Any factor above 1 is exact at
 that price; constant controls pay more for service than the bound says."""
-CORRECTIONS = 2
+CORRECTIONS = 4
 """Most programs around an episode, after the first, that are told what the episode of the one before was away from what
-it promised: a Jacobian costs as much as many of them."""
+it promised, while that is no better or lacks service: a Jacobian costs as much as many of them."""
 REFINEMENT_ROUNDS = 2
 """Most programs that are solved. Each takes about as long as the bound: the first makes up for factors that vary in the
 bound's plan, the second for what is left to first order."""
@@ -67,28 +67,34 @@ def improve_plan(
     dynamics = Dynamics(bound.network)
     if slopes_of(bound, dynamics) > MOST_SLOPES:
         return refine(bound, enough=enough, progress=progress)
-    price = prices(bound)
+    price, lack = prices(bound), np.zeros(len(bound.network.services))
     best, run = bound, simulate_plan(bound)
     value, trust, slopes = penalised_objective(bound, run, price), TRUST, None
     for done in range(rounds):
         if trust < SMALLEST or enough(run):
             break
         slopes = jacobians(best, dynamics) if slopes is None else slopes
-        program = step_program(best, dynamics, run, demand(bound), price, trust, slopes)
-        gain = 0.0
+        program = step_program(best, dynamics, run, np.minimum(demand(bound) + lack, 1.0), price, trust, slopes)
+        corrected, gain = program, 0.0
         for _ in range(1 + CORRECTIONS):
-            values = best_values(program.problem, program.scale)
+            values = best_values(corrected.problem, corrected.scale)
             if values is None:  # a smaller region is another program
                 break
-            candidate = replace(best, actions=np.clip(best.actions + values[program.action], -1.0, 1.0))
-            trial = simulate_plan(candidate)
-            gain = penalised_objective(bound, trial, price) - value
-            if gain > 0:
+            actions = np.clip(best.actions + values[program.action], -1.0, 1.0)
+            trial = simulate_plan(replace(best, actions=actions))
+            more = penalised_objective(bound, trial, price) - value
+            if more > gain:
+                better, gain = (actions, trial), more
+            elif gain > 0:
                 break
-            program = program.with_correction(values, run, trial)
+            if gain > 0 and (demand(bound) - trial.episode_levels[0]).max(initial=0.0) <= TOLERATED_SHORTFALL:
+                break
+            corrected = program.with_correction(values, run, trial)
         progress((done + 1) / rounds)
         if gain > 0:
-            best, run, value, trust, slopes = candidate, trial, value + gain, min(1.0, 2 * trust), None
+            best, run = replace(best, actions=better[0]), better[1]
+            lack = np.maximum(demand(bound) - run.episode_levels[0], 0.0)  # a step lacks about what the last one did
+            value, trust, slopes = value + gain, min(1.0, 2 * trust), None
         else:
             trust /= 4
     progress(1.0)
