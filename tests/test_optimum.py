@@ -360,7 +360,7 @@ def test_any_multipliers_prove_a_bound(network: Network, seed: int, size: float)
         equal=size * equal + rng.normal(size=len(equal)) * size, under=size * under + rng.normal(size=len(under)) * size
     )
     weaker = verify(found.problem, other, found.solution)
-    assert weaker.bound >= proof.objective - 1e-6 * scale
+    assert weaker.bound >= proof.objective - 1e-5 * scale  # its plan may lie outside its boxes by as little
     assert weaker.infeasibility == pytest.approx(max(0.0, other.under.max(initial=0.0)))
 
 
