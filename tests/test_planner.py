@@ -20,7 +20,7 @@ from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network import Floats
 from cirl_marl.network.elements import Lifetime
-from cirl_marl.optimum import NoCertificate, Plan, bound, improve_plan, program, search, simulate_plan, solver
+from cirl_marl.optimum import NoCertificate, Plan, bound, improve, improve_plan, program, search, simulate_plan, solver
 from cirl_marl.optimum.linearised import StepProgram, jacobians, step_program
 from cirl_marl.optimum.mpc import MPC
 from cirl_marl.optimum.planned_episodes import starting_states
@@ -128,6 +128,43 @@ def test_a_step_is_corrected_until_services_are_kept() -> None:
     for rounds in (1, 2):
         run = simulate_plan(improve_plan(found, rounds=rounds))
         assert run.episode_levels.min() >= 0.99 - 1e-4
+
+
+def test_the_best_of_a_round_counts_and_what_it_lacks_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Corrections start from the first program, end with one that is worse or keeps services; demands end at 1."""
+    found = bound("copper_net", min_service=0.995, horizon=3, degree=1)
+    # worth and service of the plan, of three steps of the first round and of two of the second
+    tried = iter([(0.0, 0.9), (1.0, 0.98), (3.0, 0.985), (2.0, 0.99), (2.5, 0.995), (4.0, 0.995)])
+    demands, programs, corrected = list[float](), list[object](), list[object]()
+
+    def episode(plan: object) -> SimpleNamespace:
+        worth, level = next(tried)
+        return SimpleNamespace(worth=worth, episode_levels=np.full((1, len(found.network.services)), level))
+
+    class Step(SimpleNamespace):
+        problem, scale, action = None, None, np.arange(found.actions.size).reshape(found.actions.shape)
+
+        def with_correction(self, *about: object) -> SimpleNamespace:
+            corrected.append(self)
+            return Step()
+
+    def program(plan: object, dynamics: object, run: object, demand: Floats, *rest: object) -> SimpleNamespace:
+        demands.append(float(demand.max()))
+        programs.append(Step())
+        return cast(SimpleNamespace, programs[-1])
+
+    steps = (np.full(found.actions.size, step) for step in 0.001 * 2.0 ** np.arange(5))
+    monkeypatch.setattr(improve, "simulate_plan", episode)
+    monkeypatch.setattr(improve, "jacobians", lambda plan, dynamics: ())
+    monkeypatch.setattr(improve, "step_program", program)
+    monkeypatch.setattr(improve, "best_values", lambda problem, scale: next(steps))
+    monkeypatch.setattr(improve, "penalised_objective", lambda bound, run, prices: run.worth)
+    better = improve_plan(found, rounds=2)
+    np.testing.assert_allclose(better.actions, np.clip(np.clip(found.actions + 0.002, -1, 1) + 0.016, -1, 1))
+    assert demands == [pytest.approx(0.995), 1.0]
+    first, second = programs
+    assert [each is first for each in corrected] == [True, True, False]
+    assert corrected[2] is second and next(tried, None) is None
 
 
 @pytest.mark.slow
