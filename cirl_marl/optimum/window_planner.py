@@ -35,7 +35,7 @@ from cirl_marl.optimum.admissible import Admissible, normalised_actions
 from cirl_marl.optimum.constraints import held_controls
 from cirl_marl.optimum.matrices import IntervalCache, Layout, ProgramRows
 from cirl_marl.optimum.program import Program, Programs
-from cirl_marl.optimum.solver import LARGE_PROGRAM, Basis, Solution, solve
+from cirl_marl.optimum.solver import LARGE_PROGRAM, Basis, Infeasible, Solution, SolverFailure, solve
 from cirl_marl.optimum.window_simulator import WindowSimulator, service_measures
 from cirl_marl.optimum.windows import (
     DISTANCE,
@@ -245,10 +245,11 @@ class WindowPlanner:
         Raises:
             SolverFailure: if the solver fails before there is a plan.
         """
-        best, near = None, FALLS_SHORT * self._scale
+        near = FALLS_SHORT * self._scale
+        trial = best = self._first_trial(task, basis)
+        task = replace(task, corrections=trial.task.corrections)
         for done in range(1, MOST_ROUNDS + 1):
-            trial = self._trial(task, basis)
-            if best is None or trial.merit > best.merit:
+            if trial.merit > best.merit:
                 best = trial
             promise = -float(trial.problem.cost @ trial.solution.plan)
             is_large = len(trial.problem.cost) >= LARGE_PROGRAM  # each program starts from nothing
@@ -262,17 +263,34 @@ class WindowPlanner:
                 )
                 if np.abs(error).max(initial=0.0) <= TOLERANCE:
                     break
-            basis = trial.basis(task.intervals)
-            task = replace(trial.task, corrections=trial.corrections)
-        assert best is not None
+            if done < MOST_ROUNDS:
+                task = replace(trial.task, corrections=trial.corrections)
+                trial = self._trial(task, trial.basis(task.intervals))
         return best
 
-    def _trial(self, task: WindowTask, basis: Basis | None) -> WindowPlan:
+    def _first_trial(self, task: WindowTask, basis: Basis | None) -> WindowPlan:
+        """Try a plan with what was learnt in a window before, or without where that leaves none that serves.
+
+        Controls of intervals that no window had are expected to be as in the last one, which may be out of their range.
+        """
+        if task.corrections is not None:
+            try:
+                trial = self._trial(task, basis, rises=0)
+            except (Infeasible, SolverFailure):
+                return self._trial(replace(task, corrections=None), None)
+            services = len(self.first_price)
+            is_priced = task.demand is None or task.later is not None or task.is_redrawn
+            if is_priced or trial.solution.plan[len(trial.solution.plan) - services :].max(initial=0.0) <= SHORTFALL:
+                return trial
+            task, basis = replace(task, corrections=None), None
+        return self._trial(task, basis)
+
+    def _trial(self, task: WindowTask, basis: Basis | None, rises: int = RISES) -> WindowPlan:
         """Solve the program of a task and carry its plan out in the simulator."""
         corrections = task.corrections or (None,) * len(self.futures)
         parts = [f.program(task, correction) for f, correction in zip(self.futures, corrections, strict=True)]
         joint = JointProgram.of(parts, task.demand)
-        task, solution = self._solve(joint.problem, task, basis)
+        task, solution = self._solve(joint.problem, task, basis, rises)
         triples = zip(self.futures, parts, joint.columns, strict=True)
         trials = [future.trial(part, solution.plan[columns], task) for future, part, columns in triples]
         merit, level = float(np.mean([t.value for t in trials])), np.mean([t.level for t in trials], axis=0)
@@ -283,7 +301,9 @@ class WindowPlanner:
         corrections = tuple(trial.correction for trial in trials)
         return WindowPlan(task, joint.problem, solution, trials[0].actions, corrections, promised, merit)
 
-    def _solve(self, problem: Program, task: WindowTask, basis: Basis | None) -> tuple[WindowTask, Solution]:
+    def _solve(
+        self, problem: Program, task: WindowTask, basis: Basis | None, rises: int
+    ) -> tuple[WindowTask, Solution]:
         """Solve a program, with a higher price of what lacks as long as that helps; the task comes back with it."""
         size = len(problem.cost), len(problem.equal_to) + len(problem.under_to)
         if basis is not None and (len(basis.columns), len(basis.rows)) != size:
@@ -295,13 +315,13 @@ class WindowPlanner:
         shortfall = ROUGH_SHORTFALL if is_rough else SHORTFALL
         if task.demand is None or not services:
             return task, run(problem, basis)
-        for rise in range(RISES + 1):
+        for rise in range(rises + 1):
             problem.cost[-services:] = price * (len(task.intervals) / self._horizon)
             solution = run(problem, basis, same_rows=same_rows, is_near=task.is_redrawn)
             lack, basis, same_rows = solution.plan[-services:], solution.basis, solution.basis is not None
             # what comes after was priced beside this price: another one would weigh the two differently
             has_fixed_price = task.later is not None or is_rough or (task.is_redrawn and not task.is_outlook)
-            if lack.max() <= shortfall or has_fixed_price or rise == RISES:
+            if lack.max() <= shortfall or has_fixed_price or rise == rises:
                 break
             if least is None:
                 only_lack = replace(problem, cost=np.repeat([0.0, 1.0], [len(problem.cost) - services, services]))
