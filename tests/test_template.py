@@ -108,8 +108,11 @@ def test_an_invented_store_is_told(tmp_path: Path) -> None:
     shares = re.compile(r'(from = "market"\n.*\n)law = "share"\nshare = .*')
     ordered = tmp_path / "ordered.toml"
     ordered.write_text(shares.sub(rf"\1{order}", text))
-    with pytest.raises(CirlError, match="only law 'share' can leave it; for products with demands of their own let it"):
+    with pytest.raises(CirlError) as refused:
         load_network(ordered)
+    by = "ordered by arcs 'recycled_buildings', 'recycled_cars', 'recycled_cans'; for products with demands of their own"
+    assert str(refused.value).startswith(f"{ordered}: node 'market': it stores nothing, so that only law 'share' can")
+    assert f"{by} let it share out what is recycled" in str(refused.value) and len(str(refused.value).splitlines()) == 1
     stock = f"initial = {{ low = 90, high = 90, {SOURCE.replace('/year', '')} }}"
     head, tail = ordered.read_text().split("[nodes.market]")
     ordered.write_text(f"{head}[nodes.market]{tail.replace('stores = false', stock, 1)}")

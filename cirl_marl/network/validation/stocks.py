@@ -59,11 +59,15 @@ def storage_problems(node: Node, outflows: Sequence[Arc]) -> Iterator[str]:
         yield f"{subject}: role '{node.role}': a node that stores nothing is of the technosphere"
     if not outflows:
         yield f"{subject}: it stores nothing and no arc leaves it, so that what enters has nowhere to go"
+    orders = [arc.id for arc in outflows if arc.law in (Law.CONTROLLED, Law.EXOGENOUS)]
+    if orders:
+        arcs = f"arc{'s' * (len(orders) > 1)} {', '.join(map(repr, orders))}"
+        reason = f"it stores nothing, so that only law 'share' can leave it, not what is ordered by {arcs}"
+        yield f"{subject}: {reason}; {OWN_DEMANDS}"
     for arc in outflows:
-        if arc.law is not Law.SHARE:
+        if arc.law is not Law.SHARE and arc.id not in orders:
             reason = f"its donor '{node.id}' stores nothing, so that only law 'share' can leave it"
-            remedy = f"; {OWN_DEMANDS}" if arc.law is Law.CONTROLLED else ""
-            yield f"arc '{arc.id}': law '{arc.law}': {reason}{remedy}"
+            yield f"arc '{arc.id}': law '{arc.law}': {reason}"
 
 
 def series_problems(network: Specification) -> Iterator[str]:
