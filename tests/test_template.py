@@ -110,7 +110,9 @@ def test_an_invented_store_is_told(tmp_path: Path) -> None:
     ordered.write_text(shares.sub(rf"\1{order}", text))
     with pytest.raises(CirlError) as refused:
         load_network(ordered)
-    by = "ordered by arcs 'recycled_buildings', 'recycled_cars', 'recycled_cans'; for products with demands of their own"
+    by = (
+        "ordered by arcs 'recycled_buildings', 'recycled_cars', 'recycled_cans'; for products with demands of their own"
+    )
     assert str(refused.value).startswith(f"{ordered}: node 'market': it stores nothing, so that only law 'share' can")
     assert f"{by} let it share out what is recycled" in str(refused.value) and len(str(refused.value).splitlines()) == 1
     stock = f"initial = {{ low = 90, high = 90, {SOURCE.replace('/year', '')} }}"

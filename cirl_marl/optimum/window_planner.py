@@ -20,7 +20,7 @@ is added to its constraints).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
@@ -55,7 +55,8 @@ had, and how often at most."""
 SHORTFALL, ROUGH_SHORTFALL = 1e-6, 1e-4
 """Mean level that a plan may lack of what is demanded without a higher price; where it is solved roughly."""
 ROUNDS, MOST_ROUNDS, LARGE_ROUNDS = 3, 10, 2
-"""Most programs for a plan, but for those with higher prices: usually, while it falls short, and of large programs."""
+"""Most programs for a plan, but for those with higher prices: usually, while it falls short, and of large programs, of
+whose outlooks the first will do."""
 FALLS_SHORT = 2e-3
 """By how much the simulator must not miss what a program promises, in λ̄/circularity_scale."""
 TOLERANCE = 2e-4
@@ -254,7 +255,7 @@ class WindowPlanner:
             promise = -float(trial.problem.cost @ trial.solution.plan)
             is_large = len(trial.problem.cost) >= LARGE_PROGRAM  # each program starts from nothing
             is_near = task.is_redrawn or promise - best.merit <= near
-            if (done >= ROUNDS and is_near) or (is_large and done == LARGE_ROUNDS):
+            if (done >= ROUNDS and is_near) or (is_large and (task.is_outlook or done == LARGE_ROUNDS)):
                 break
             if task.corrections is not None:
                 pairs = zip(trial.corrections, task.corrections, strict=True)
@@ -315,7 +316,8 @@ class WindowPlanner:
         shortfall = ROUGH_SHORTFALL if is_rough else SHORTFALL
         if task.demand is None or not services:
             return task, run(problem, basis)
-        for rise in range(rises + 1):
+        solution = self._all_demanded(problem, run) if is_rough else None
+        for rise in range(rises + 1 if solution is None else 0):
             problem.cost[-services:] = price * (len(task.intervals) / self._horizon)
             solution = run(problem, basis, same_rows=same_rows, is_near=task.is_redrawn)
             lack, basis, same_rows = solution.plan[-services:], solution.basis, solution.basis is not None
@@ -329,7 +331,20 @@ class WindowPlanner:
             if lack.sum() <= least + shortfall * services:
                 break
             price = np.where(lack > shortfall, price * RISE, price)
+        assert solution is not None
         if task.is_outlook:  # what turns out dearer within windows is not left undone
-            multipliers = -solution.certificate.under[-services:]
+            multipliers, lack = -solution.certificate.under[-services:], solution.plan[-services:]
             price = np.where(lack > shortfall, price, np.maximum(price, FIRST_PRICE * multipliers))
         return replace(task, price=price), solution
+
+    def _all_demanded(self, problem: Program, run: Callable[[Program, None], Solution]) -> Solution | None:
+        """Return the optimum of a program in which no service may lack anything; None if there is none.
+
+        Of a large program it is tried first: where prices of service are far above all other costs, HiPO stops early.
+        """
+        cost, high, services = problem.cost.copy(), problem.high.copy(), len(self.first_price)
+        cost[-services:], high[-services:] = 0.0, 0.0
+        try:
+            return run(replace(problem, cost=cost, high=high), None)
+        except (Infeasible, SolverFailure):
+            return None
