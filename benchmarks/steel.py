@@ -12,8 +12,10 @@ import csv
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 from benchmarks.document import write_sections
 from benchmarks.plans import DOCUMENT as CYCLES
@@ -33,7 +35,7 @@ ENVS, DOCUMENT = ROOT / "envs", ROOT / "docs" / "data.md"
 YEARS = range(2000, 2025)
 RECENT = slice(20, 25)
 """2020 to 2024, whose mean stands for today."""
-FUTURE = (2025, 2050)
+FUTURE = range(2025, 2051)
 CALIBRATED, TESTED = slice(0, 15), slice(15, 25)
 LAST = slice(12, 15)
 """2012 to 2014: the rate of collection is what makes old scrap of these years agree."""
@@ -46,8 +48,6 @@ SECTORS = {
 """Share of what goes into use, and mean life in years."""
 BEST_COLLECTION = 0.88
 """Recovery of discards in 2050, the four sectors weighted by what goes into use."""
-STEEPEST = 0.05
-"""Largest growth of stock per head that is carried on, 1/a."""
 UNRELIABLE = 0.25
 """Error of hindcasts within 2000-2014 beyond which a country is called unreliable."""
 ORIGINS = range(8, 15)
@@ -144,9 +144,11 @@ class Country:
         return np.diff(np.maximum(np.concatenate([[0.0], np.cumsum(found)]) - exported, 0.0))
 
 
-RAW_EXPORTS = ("ore_exports", "pig_iron_exports", "dri_exports")
-"""What leaves a country as raw iron counts where it is made into steel, so that there is none in the future."""
+RAW_EXPORTS = ("ore_exports",)
+"""Exported ore counts where iron is made of it, so that there is none in the future."""
 PRIMARY = ("mining", "ore_imports", "pig_iron_imports", "dri_imports")
+IMPORTS = ("scrap_imports", "semis_imports", "long_imports", "flat_imports", "goods_imports")
+"""What is imported beside primary iron: as much of what goes into use as today."""
 
 
 def countries(table: FlowTable) -> list[Country]:
@@ -192,8 +194,10 @@ def today(country: Country, pooled: Mapping[str, Floats]) -> dict[str, float]:
     return found | {arc: float(country.flows[arc][RECENT].mean()) for arc in EXOGENOUS}
 
 
-def write_flows(everyone: Sequence[Country], pooled: Mapping[str, Floats]) -> None:
-    """Write flows and shares, the same for all years from 2025 on."""
+def write_flows(
+    everyone: Sequence[Country], pooled: Mapping[str, Floats], known: Mapping[str, Mapping[str, Any]]
+) -> None:
+    """Write flows and shares; from 2025 on shares are those of today, and imports follow use as usual."""
     rests = {next(iter(arcs)) for arcs in SPLITS.values()}
     columns = [*EXOGENOUS, *(arc for arcs in SPLITS.values() for arc in arcs if arc not in rests)]
     rows: list[list[object]] = []
@@ -202,7 +206,10 @@ def write_flows(everyone: Sequence[Country], pooled: Mapping[str, Floats]) -> No
         values |= {arc: country.flows[arc] for arc in EXOGENOUS}
         later = today(country, pooled)
         rows += [[country.name, year, *(_said(values[arc][y]) for arc in columns)] for y, year in enumerate(YEARS)]
-        rows += [[country.name, year, *(_said(later[arc]) for arc in columns)] for year in FUTURE]
+        growth = known.get(country.name, {}).get("use", np.ones(len(FUTURE)))
+        for year, factor in zip(FUTURE, growth, strict=True):
+            now = {arc: later[arc] * (factor if arc in IMPORTS else 1.0) for arc in columns}
+            rows.append([country.name, year, *(_said(now[arc]) for arc in columns)])
     write_table(ENVS / "steel.csv", ["region", "year", *columns], rows)
 
 
@@ -252,8 +259,8 @@ def write_regions(
     """Write what differs from country to country alone; ``known`` are columns that follow from simulations."""
     rows: list[list[object]] = []
     for country in everyone:
-        row: dict[str, float] = {"collection": 0.5, "stock_scale": 1.0, "exports": 1.0}
-        row.update(known.get(country.name, {}))
+        row = {"collection": 0.5, "hindcast_collection": 0.5, "stock_scale": 1.0, "exports": 1.0}
+        row |= {name: known.get(country.name, {}).get(name, value) for name, value in row.items()}
         row["flow_scale"] = float(country.flows["into_use"][RECENT].mean())
         primary = country.primary
         parts = primary / primary.sum() if primary.sum() > 0 else np.eye(len(PRIMARY))[1]
@@ -282,12 +289,13 @@ def write_demand(
     rows: list[list[object]] = []
     for country in everyone:
         own, known_ = people[country.name], known.get(country.name, {})
-        years = np.arange(FUTURE[0], FUTURE[1] + 2)
-        population = np.interp(years, [*own], [*own.values()])
-        growth = float(np.clip(known_.get("growth", 0.0), 0.0, STEEPEST))
-        # a rate that fades to none in 2050
-        elapsed = np.minimum(years - FUTURE[0], 25.0)
-        head = known_.get("stock_scale", 1.0) * 1e3 / population[0] * np.exp(growth * (elapsed - elapsed**2 / 50))
+        years = np.array([*FUTURE, FUTURE.stop])
+        population = PchipInterpolator([*own], [*own.values()])(np.append(years[0] - 1, years))
+        # the growth of stock per head that goes on from what goes into use today fades to none in 2050
+        elapsed = np.minimum(years - years[0], 25.0)
+        stock, fading = known_.get("stock_scale", 1.0), np.cumsum(1.0 - elapsed / 25)
+        growth = np.log1p(known_.get("net_addition", 0.0) / stock) - np.log(population[1] / population[0])
+        head, population = 1e3 * stock / population[0] * np.exp(growth * fading), population[1:]
         passed, now, rate = elapsed / 25, today(country, pooled), known_.get("collection", 0.5)
         best = rate + passed * (max(rate, BEST_COLLECTION) - rate) + WIDTH * (rate >= BEST_COLLECTION)
         halved = [now[arc] * (1 - passed / 2) for arc in HALVED]
@@ -342,27 +350,35 @@ def pasts(everyone: Sequence[Country]) -> list[Past]:
 def write_all(everyone: Sequence[Country]) -> None:
     """Write all data files: flows, then what follows from simulations of them."""
     pooled = {arc: np.sum([each.flows[arc] for each in everyone], axis=0) for arc in everyone[0].flows}
-    known: dict[str, dict[str, float]] = {}
-    people = populations()
-    write_flows(everyone, pooled)
-    write_regions(everyone, pooled, known)
-    write_demand(everyone, pooled, known)
+    known: dict[str, dict[str, Any]] = {each.name: {} for each in everyone}
+
+    def write() -> None:
+        write_flows(everyone, pooled, known)
+        write_regions(everyone, pooled, known)
+        write_demand(everyone, pooled, known)
+
+    write()
     for past in pasts(everyone):
-        own = people[past.country.name]
-        growth = float(np.log(past.stock[-1] / past.stock[-11]) - np.log(own[2025] / own[2015])) / 10
-        known[past.country.name] = {
-            "collection": past.collection(),
-            "stock_scale": float(past.stock[-1]),
-            "growth": growth,
-        }
-    write_regions(everyone, pooled, known)
-    write_demand(everyone, pooled, known)
+        own = known[past.country.name]
+        own |= {"stock_scale": float(past.stock[-1]), "hindcast_collection": past.collection()}
+    write()
     ids = identifiers(each.name for each in everyone)
-    for name, region in ids.items():
-        flows, _ = simulated(region, "default")
+    for country in everyone:
+        flows, _ = simulated(ids[country.name], "default")
+        own, used, scrap = known[country.name], country.flows["into_use"], country.flows["old_scrap"]
+        discards = float(flows["old_scrap"][0] + flows["left"][0])
+        own["net_addition"] = float(used[RECENT].mean()) - discards
+        own["collection"] = min(1.0 - WIDTH, float(scrap[RECENT].mean()) / discards)
+    write()
+    for country in everyone:
+        flows, _ = simulated(ids[country.name], "default")
+        known[country.name]["use"] = flows["goods_to_use"] / flows["goods_to_use"][0]
+    write()
+    for country in everyone:
+        flows, _ = simulated(ids[country.name], "default")
         exported = sum(flows[arc] for arc in RANGES if arc.endswith("exports") and arc != "scrap_exports")
-        known[name]["exports"] = 0.9 * float(np.min(exported))
-    write_regions(everyone, pooled, known)
+        known[country.name]["exports"] = 0.9 * float(np.min(exported))
+    write()
 
 
 def hindcast_lines(found: Sequence[Past]) -> Iterator[str]:
