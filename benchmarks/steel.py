@@ -31,12 +31,15 @@ from cirl_marl.records.files import write_table
 ROOT = Path(__file__).parent.parent
 TABLE = ROOT / "benchmarks" / "data" / "steel_flows_2000_2024.csv"
 POPULATION = ROOT / "benchmarks" / "data" / "population.csv"
+PRODUCTION = ROOT / "benchmarks" / "data" / "steel_production_1900_2016.csv"
 ENVS, DOCUMENT = ROOT / "envs", ROOT / "docs" / "data.md"
 YEARS = range(2000, 2025)
 RECENT = slice(20, 25)
 """2020 to 2024, whose mean stands for today."""
 FUTURE = range(2025, 2051)
 CALIBRATED, TESTED = slice(0, 15), slice(15, 25)
+FIRST, JOINED = slice(0, 3), slice(98, 101)
+"""2000 to 2002 of what goes into use, and 1998 to 2000 of production since 1900: what joins the two."""
 LAST = slice(12, 15)
 """2012 to 2014: the rate of collection is what makes old scrap of these years agree."""
 SECTORS = {
@@ -267,10 +270,6 @@ def write_regions(
         for arc, part in zip(PRIMARY, parts.tolist(), strict=True):
             row[f"{arc}_weight"] = part
             row[f"{arc}_most"] = 3 * float(country.flows[arc].max()) + 1.0
-        row |= {
-            f"initial_{sector}": float(country.flows["into_use"][0]) * part * mean
-            for sector, (part, mean) in SECTORS.items()
-        }
         now = today(country, pooled)
         for arc in HALVED:
             row |= _range(arc, now[arc] / 2, now[arc], now[arc])
@@ -279,6 +278,20 @@ def write_regions(
         rows.append([country.name, *(_said(value) for _, value in sorted(row.items()))])
     header = sorted(row)
     write_table(ENVS / "steel_regions.csv", ["region", *header], rows)
+
+
+def write_history(everyone: Sequence[Country]) -> None:
+    """Write what went into use from 1900 on: before 2000 in proportion to the iron and steel that was made."""
+    made: dict[str, list[float]] = {}
+    with PRODUCTION.open(encoding="utf-8", newline="") as file:
+        for line in csv.DictReader(file):
+            made.setdefault(line["region"], []).append(float(line["kt"]))
+    rows: list[list[object]] = []
+    for country in everyone:
+        used, own = country.flows["into_use"], np.array(made[country.name])
+        before = own[:100] * used[FIRST].mean() / own[JOINED].mean()
+        rows += [[country.name, year, _said(v)] for year, v in enumerate(np.concatenate([before, used]), YEARS[0] - 100)]
+    write_table(ENVS / "steel_history.csv", ["region", "year", "into_use"], rows)
 
 
 def write_demand(
@@ -351,6 +364,8 @@ def write_all(everyone: Sequence[Country]) -> None:
     """Write all data files: flows, then what follows from simulations of them."""
     pooled = {arc: np.sum([each.flows[arc] for each in everyone], axis=0) for arc in everyone[0].flows}
     known: dict[str, dict[str, Any]] = {each.name: {} for each in everyone}
+
+    write_history(everyone)
 
     def write() -> None:
         write_flows(everyone, pooled, known)
