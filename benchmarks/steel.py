@@ -1,18 +1,17 @@
 """The data of ``envs/steel.toml``, and what was measured with it; ``docs/data.md`` has the sources.
 
-python -m benchmarks.steel             # writes envs/steel.csv, steel_regions.csv and steel_demand.csv anew
-python -m benchmarks.steel --hindcast  # old scrap in 2015-2024, in docs/data.md
-python -m benchmarks.steel --plans     # bounds and plans of every country, in docs/cycles.md (half an hour)
+python -m benchmarks.steel          # writes envs/steel.csv, steel_history, steel_regions and steel_demand anew
+python -m benchmarks.steel --plans  # bounds and plans of every country, in docs/cycles.md (half an hour)
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -20,6 +19,7 @@ from scipy.interpolate import PchipInterpolator
 from benchmarks.document import write_sections
 from benchmarks.plans import DOCUMENT as CYCLES
 from benchmarks.plans import plan_lines
+from benchmarks.steel_calibration import Posterior, calibrate
 from cirl_marl import MultiAgentVectorEnv, load_network
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import episode_start, rollout
@@ -37,11 +37,8 @@ YEARS = range(2000, 2025)
 RECENT = slice(20, 25)
 """2020 to 2024, whose mean stands for today."""
 FUTURE = range(2025, 2051)
-CALIBRATED, TESTED = slice(0, 15), slice(15, 25)
 FIRST, JOINED = slice(0, 3), slice(98, 101)
 """2000 to 2002 of what goes into use, and 1998 to 2000 of production since 1900: what joins the two."""
-LAST = slice(12, 15)
-"""2012 to 2014: the rate of collection is what makes old scrap of these years agree."""
 SECTORS = {
     "vehicles": (0.22, 20.0),
     "machinery": (0.13, 30.0),
@@ -51,10 +48,6 @@ SECTORS = {
 """Share of what goes into use, and mean life in years."""
 BEST_COLLECTION = 0.88
 """Recovery of discards in 2050, the four sectors weighted by what goes into use."""
-UNRELIABLE = 0.25
-"""Error of hindcasts within 2000-2014 beyond which a country is called unreliable."""
-ORIGINS = range(8, 15)
-"""Years after 2000 from which hindcasts within 2000-2014 start."""
 
 EXOGENOUS = {
     "mining": [("Mining", "Market of iron ore")],
@@ -135,6 +128,15 @@ class Country:
 
     name: str
     flows: Mapping[str, Floats]
+    production: Annotated[Floats, "iron and steel that was made, 1900-2016, kt/a"]
+
+    @property
+    def earlier_use(self) -> Floats:
+        """What went into use in 1900-1999, kt/a, in proportion to what was made."""
+        used: Floats = (
+            self.production[: JOINED.stop - 1] * self.flows["into_use"][FIRST].mean() / self.production[JOINED].mean()
+        )
+        return used
 
     @property
     def primary(self) -> Floats:
@@ -166,14 +168,24 @@ def countries(table: FlowTable) -> list[Country]:
     missing = {(source, target) for _, source, target in summed} - known
     if missing:
         raise SystemExit(f"no arc stands for {sorted(missing)}")
-    nothing = np.zeros(len(YEARS))
+    nothing, made = np.zeros(len(YEARS)), production()
     return [
         Country(
             region,
             {arc: sum((summed.get((region, *ends), nothing) for ends in each), nothing) for arc, each in pairs.items()},
+            made[region],
         )
-        for region in table.regions
+        for region in sorted(table.regions)
     ]
+
+
+def production() -> dict[str, Floats]:
+    """Return the iron and steel that each country made in 1900-2016, kt/a."""
+    made: dict[str, list[float]] = {}
+    with PRODUCTION.open(encoding="utf-8", newline="") as file:
+        for line in csv.DictReader(file):
+            made.setdefault(line["region"], []).append(float(line["kt"]))
+    return {region: np.array(values) for region, values in made.items()}
 
 
 def shares(country: Country, pooled: Mapping[str, Floats]) -> dict[str, Floats]:
@@ -197,125 +209,10 @@ def today(country: Country, pooled: Mapping[str, Floats]) -> dict[str, float]:
     return found | {arc: float(country.flows[arc][RECENT].mean()) for arc in EXOGENOUS}
 
 
-def write_flows(
-    everyone: Sequence[Country], pooled: Mapping[str, Floats], known: Mapping[str, Mapping[str, Any]]
-) -> None:
-    """Write flows and shares; from 2025 on shares are those of today, and imports follow use as usual."""
-    rests = {next(iter(arcs)) for arcs in SPLITS.values()}
-    columns = [*EXOGENOUS, *(arc for arcs in SPLITS.values() for arc in arcs if arc not in rests)]
-    rows: list[list[object]] = []
-    for country in everyone:
-        values = {arc: column[:-1] for arc, column in shares(country, pooled).items()}
-        values |= {arc: country.flows[arc] for arc in EXOGENOUS}
-        later = today(country, pooled)
-        rows += [[country.name, year, *(_said(values[arc][y]) for arc in columns)] for y, year in enumerate(YEARS)]
-        growth = known.get(country.name, {}).get("use", np.ones(len(FUTURE)))
-        for year, factor in zip(FUTURE, growth, strict=True):
-            now = {arc: later[arc] * (factor if arc in IMPORTS else 1.0) for arc in columns}
-            rows.append([country.name, year, *(_said(now[arc]) for arc in columns)])
-    write_table(ENVS / "steel.csv", ["region", "year", *columns], rows)
-
-
-@dataclass(frozen=True, slots=True)
-class Past:
-    """What the model of lifetimes makes of 2000-2024 in a country."""
-
-    country: Country
-    discards: Floats
-    stock: Floats
-
-    def collection(self, end: int = LAST.stop) -> float:
-        """Return the rate that makes old scrap of the three years before ``end`` agree, at most 1."""
-        last = slice(max(0, end - 3), end)
-        return min(1.0, float(self.country.flows["old_scrap"][last].sum() / self.discards[last].sum()))
-
-    def error(self, end: int, years: slice) -> float:
-        """Return Σ|modelled − reported old scrap|/Σ reported of some years, calibrated before ``end``."""
-        reported = self.country.flows["old_scrap"][years]
-        modelled = self.collection(end) * self.discards[years]
-        return float(np.abs(modelled - reported).sum() / reported.sum()) if reported.sum() > 0 else float("nan")
-
-    @property
-    def persistence(self) -> float:
-        """The error of the value of 2014 in 2015-2024."""
-        reported = self.country.flows["old_scrap"]
-        lasting = np.abs(reported[TESTED] - reported[CALIBRATED][-1]).sum()
-        return float(lasting / reported[TESTED].sum()) if reported[TESTED].sum() > 0 else float("nan")
-
-    @property
-    def earlier(self) -> float:
-        """The error within 2000-2014, of hindcasts from 2008 to 2014."""
-        reported = self.country.flows["old_scrap"]
-        parts = [(self.collection(end) * self.discards[end:15] - reported[end:15], reported[end:15]) for end in ORIGINS]
-        total = sum(float(each.sum()) for _, each in parts)
-        return sum(float(np.abs(off).sum()) for off, _ in parts) / total if total > 0 else float("inf")
-
-    @property
-    def unreliable(self) -> bool:
-        """Whether 2000-2014 say that the model is not to be believed."""
-        return self.earlier > UNRELIABLE or bool((self.country.flows["old_scrap"][CALIBRATED] == 0).any())
-
-
-def write_regions(
-    everyone: Sequence[Country], pooled: Mapping[str, Floats], known: Mapping[str, Mapping[str, float]]
-) -> None:
-    """Write what differs from country to country alone; ``known`` are columns that follow from simulations."""
-    rows: list[list[object]] = []
-    for country in everyone:
-        row = {"collection": 0.5, "hindcast_collection": 0.5, "stock_scale": 1.0, "exports": 1.0}
-        row |= {name: known.get(country.name, {}).get(name, value) for name, value in row.items()}
-        row["flow_scale"] = float(country.flows["into_use"][RECENT].mean())
-        primary = country.primary
-        parts = primary / primary.sum() if primary.sum() > 0 else np.eye(len(PRIMARY))[1]
-        for arc, part in zip(PRIMARY, parts.tolist(), strict=True):
-            row[f"{arc}_weight"] = part
-            row[f"{arc}_most"] = 3 * float(country.flows[arc].max()) + 1.0
-        now = today(country, pooled)
-        for arc in HALVED:
-            row |= _range(arc, now[arc] / 2, now[arc], now[arc])
-        for arc, (least, most) in RANGES.items():
-            row |= _range(arc, least * now[arc], now[arc], min(1.0, most * now[arc]))
-        rows.append([country.name, *(_said(value) for _, value in sorted(row.items()))])
-    header = sorted(row)
-    write_table(ENVS / "steel_regions.csv", ["region", *header], rows)
-
-
-def write_history(everyone: Sequence[Country]) -> None:
-    """Write what went into use from 1900 on: before 2000 in proportion to the iron and steel that was made."""
-    made: dict[str, list[float]] = {}
-    with PRODUCTION.open(encoding="utf-8", newline="") as file:
-        for line in csv.DictReader(file):
-            made.setdefault(line["region"], []).append(float(line["kt"]))
-    rows: list[list[object]] = []
-    for country in everyone:
-        used, own = country.flows["into_use"], np.array(made[country.name])
-        before = own[:100] * used[FIRST].mean() / own[JOINED].mean()
-        rows += [[country.name, year, _said(v)] for year, v in enumerate(np.concatenate([before, used]), YEARS[0] - 100)]
-    write_table(ENVS / "steel_history.csv", ["region", "year", "into_use"], rows)
-
-
-def write_demand(
-    everyone: Sequence[Country], pooled: Mapping[str, Floats], known: Mapping[str, Mapping[str, float]]
-) -> None:
-    """Write population, stock per head, and how much can be collected and saved, from 2025 to 2051."""
-    people = populations()
-    rows: list[list[object]] = []
-    for country in everyone:
-        own, known_ = people[country.name], known.get(country.name, {})
-        years = np.array([*FUTURE, FUTURE.stop])
-        population = PchipInterpolator([*own], [*own.values()])(np.append(years[0] - 1, years))
-        # the growth of stock per head that goes on from what goes into use today fades to none in 2050
-        elapsed = np.minimum(years - years[0], 25.0)
-        stock, fading = known_.get("stock_scale", 1.0), np.cumsum(1.0 - elapsed / 25)
-        growth = np.log1p(known_.get("net_addition", 0.0) / stock) - np.log(population[1] / population[0])
-        head, population = 1e3 * stock / population[0] * np.exp(growth * fading), population[1:]
-        passed, now, rate = elapsed / 25, today(country, pooled), known_.get("collection", 0.5)
-        best = rate + passed * (max(rate, BEST_COLLECTION) - rate) + WIDTH * (rate >= BEST_COLLECTION)
-        halved = [now[arc] * (1 - passed / 2) for arc in HALVED]
-        for row in zip(years.tolist(), population, head, best, *halved, strict=True):
-            rows.append([country.name, row[0], *map(_said, row[1:])])
-    write_table(
-        ENVS / "steel_demand.csv", ["region", "year", "population", "stock_per_head", "collection_most", *HALVED], rows
+def calibrated(country: Country, years: slice = slice(0, 25), recent: slice = RECENT) -> Posterior:
+    """Return what old scrap of some years says of stocks, lifetimes and collection."""
+    return calibrate(
+        country.earlier_use, country.flows["into_use"], country.flows["old_scrap"], SECTORS, years=years, recent=recent
     )
 
 
@@ -326,6 +223,136 @@ def populations() -> dict[str, dict[int, float]]:
         for line in csv.DictReader(file):
             people.setdefault(line["region"], {})[int(line["year"])] = 1e3 * float(line["thousands"])
     return people
+
+
+@dataclass(slots=True)
+class Calibration:
+    """What is calibrated or follows from simulations, in one country."""
+
+    level: float
+    """Factor on what went into use before 2000."""
+    stock_scale: float = 1.0
+    """In use at the end of 2024, kt."""
+    collection: float = 0.5
+    net_addition: float = 0.0
+    """To what is in use, in 2025, kt."""
+    exports: float = 1.0
+    """Of steel, the least of what is demanded, kt/a."""
+    use: Floats = field(default_factory=lambda: np.ones(len(FUTURE)))
+    """What goes into use, 2025 to 2050, as a factor on 2025."""
+
+
+class Files:
+    """The data files of some countries, in a folder."""
+
+    def __init__(self, known: Mapping[str, Calibration], everyone: Sequence[Country], folder: Path = ENVS) -> None:
+        """Take what stands in files.
+
+        Args:
+            known: what is calibrated or follows from simulations, by country.
+            everyone: all countries, whose shares stand in where one has none of its own.
+            folder: where ``steel.toml`` and its data are.
+        """
+        self.known, self.folder = known, folder
+        self.countries = [each for each in everyone if each.name in known]
+        self.pooled = {arc: np.sum([each.flows[arc] for each in everyone], axis=0) for arc in everyone[0].flows}
+
+    def write(self) -> None:
+        """Write all of them."""
+        self.write_flows()
+        self.write_history()
+        self.write_regions()
+        self.write_demand()
+
+    def write_flows(self) -> None:
+        """Write flows and shares; from 2025 on shares are those of today, and imports follow use as usual."""
+        rests = {next(iter(arcs)) for arcs in SPLITS.values()}
+        columns = [*EXOGENOUS, *(arc for arcs in SPLITS.values() for arc in arcs if arc not in rests)]
+        rows: list[list[object]] = []
+        for country in self.countries:
+            values = {arc: column[:-1] for arc, column in shares(country, self.pooled).items()}
+            values |= {arc: country.flows[arc] for arc in EXOGENOUS}
+            later = today(country, self.pooled)
+            rows += [[country.name, year, *(_said(values[arc][y]) for arc in columns)] for y, year in enumerate(YEARS)]
+            for year, factor in zip(FUTURE, self.known[country.name].use, strict=True):
+                now = {arc: later[arc] * (factor if arc in IMPORTS else 1.0) for arc in columns}
+                rows.append([country.name, year, *(_said(now[arc]) for arc in columns)])
+        write_table(self.folder / "steel.csv", ["region", "year", *columns], rows)
+
+    def write_history(self) -> None:
+        """Write what went into use from 1900 on."""
+        rows: list[list[object]] = []
+        for country in self.countries:
+            used = np.concatenate([self.known[country.name].level * country.earlier_use, country.flows["into_use"]])
+            rows += [[country.name, year, _said(value)] for year, value in enumerate(used, YEARS.stop - len(used))]
+        write_table(self.folder / "steel_history.csv", ["region", "year", "into_use"], rows)
+
+    def write_regions(self) -> None:
+        """Write what differs from country to country alone."""
+        rows: list[list[object]] = []
+        for country in self.countries:
+            known = self.known[country.name]
+            row = {name: getattr(known, name) for name in ("collection", "stock_scale", "exports")}
+            row["flow_scale"] = float(country.flows["into_use"][RECENT].mean())
+            primary = country.primary
+            parts = primary / primary.sum() if primary.sum() > 0 else np.eye(len(PRIMARY))[1]
+            for arc, part in zip(PRIMARY, parts.tolist(), strict=True):
+                row[f"{arc}_weight"] = part
+                row[f"{arc}_most"] = 3 * float(country.flows[arc].max()) + 1.0
+            now = today(country, self.pooled)
+            for arc in HALVED:
+                row |= _range(arc, now[arc] / 2, now[arc], now[arc])
+            for arc, (least, most) in RANGES.items():
+                row |= _range(arc, least * now[arc], now[arc], min(1.0, most * now[arc]))
+            rows.append([country.name, *(_said(value) for _, value in sorted(row.items()))])
+        write_table(self.folder / "steel_regions.csv", ["region", *sorted(row)], rows)
+
+    def write_demand(self) -> None:
+        """Write population, stock per head, and how much can be collected and saved, from 2025 to 2051."""
+        people = populations()
+        rows: list[list[object]] = []
+        for country in self.countries:
+            own, known = people[country.name], self.known[country.name]
+            years = np.array([*FUTURE, FUTURE.stop])
+            population = PchipInterpolator([*own], [*own.values()])(np.append(years[0] - 1, years))
+            # the growth of stock per head that goes on from what goes into use today fades to none in 2050
+            elapsed = np.minimum(years - years[0], 25.0)
+            growth = np.log1p(known.net_addition / known.stock_scale) - np.log(population[1] / population[0])
+            head = 1e3 * known.stock_scale / population[0] * np.exp(growth * np.cumsum(1.0 - elapsed / 25))
+            passed, now, rate = elapsed / 25, today(country, self.pooled), known.collection
+            best = rate + passed * (max(rate, BEST_COLLECTION) - rate) + WIDTH * (rate >= BEST_COLLECTION)
+            halved = [now[arc] * (1 - passed / 2) for arc in HALVED]
+            for row in zip(years.tolist(), population[1:], head, best, *halved, strict=True):
+                rows.append([country.name, row[0], *map(_said, row[1:])])
+        header = ["region", "year", "population", "stock_per_head", "collection_most", *HALVED]
+        write_table(self.folder / "steel_demand.csv", header, rows)
+
+    def simulated(self, country: Country, scenario: str = "default") -> tuple[dict[str, Floats], dict[str, Floats]]:
+        """Return flows by arc and stocks by node of a country in which nobody acts."""
+        return simulated(identifiers([country.name])[country.name], scenario, self.folder)
+
+    def simulate(self) -> None:
+        """Find what follows from simulations, and write it: stock, demand, collection, imports, exports."""
+        self.write()
+        for country in self.countries:
+            _, stocks = self.simulated(country, "hindcast")
+            self.known[country.name].stock_scale = float(sum(stocks[sector][-1] for sector in SECTORS))
+        self.write()
+        for country in self.countries:
+            known, (flows, _) = self.known[country.name], self.simulated(country)
+            discards = float(flows["old_scrap"][0] + flows["left"][0])
+            known.net_addition = float(country.flows["into_use"][RECENT].mean()) - discards
+            known.collection = min(1.0 - WIDTH, float(country.flows["old_scrap"][RECENT].mean()) / discards)
+        self.write()
+        for country in self.countries:
+            flows, _ = self.simulated(country)
+            self.known[country.name].use = flows["goods_to_use"] / flows["goods_to_use"][0]
+        self.write()
+        for country in self.countries:
+            flows, _ = self.simulated(country)
+            exported = sum(flows[arc] for arc in RANGES if arc.endswith("exports") and arc != "scrap_exports")
+            self.known[country.name].exports = 0.9 * float(np.min(exported))
+        self.write()
 
 
 WIDTH = 1e-3
@@ -340,9 +367,9 @@ def _said(value: float) -> str:
     return f"{float(value):.9g}"
 
 
-def simulated(region: str, scenario: str) -> tuple[dict[str, Floats], dict[str, Floats]]:
+def simulated(region: str, scenario: str, folder: Path = ENVS) -> tuple[dict[str, Floats], dict[str, Floats]]:
     """Return flows by arc and stocks by node of a scenario in which nobody acts."""
-    network = load_network(f"{ENVS / 'steel.toml'}:{region}", scenario=scenario)
+    network = load_network(f"{folder / 'steel.toml'}:{region}", scenario=scenario)
     env = MultiAgentVectorEnv(network, num_envs=1)
     begun = episode_start(env)
     run = rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
@@ -350,83 +377,19 @@ def simulated(region: str, scenario: str) -> tuple[dict[str, Floats], dict[str, 
     return flows, {node.id: run.stock[:, i] for i, node in enumerate(network.stores)}
 
 
-def pasts(everyone: Sequence[Country]) -> list[Past]:
-    """Return the hindcasts of all countries, by the scenario of that name."""
-    found = []
-    for country, region in zip(everyone, identifiers(each.name for each in everyone).values(), strict=True):
-        flows, stocks = simulated(region, "hindcast")
-        stock = np.sum([stocks[sector] for sector in SECTORS], axis=0)
-        found.append(Past(country, flows["old_scrap"] + flows["left"], stock))
-    return found
-
-
-def write_all(everyone: Sequence[Country]) -> None:
-    """Write all data files: flows, then what follows from simulations of them."""
-    pooled = {arc: np.sum([each.flows[arc] for each in everyone], axis=0) for arc in everyone[0].flows}
-    known: dict[str, dict[str, Any]] = {each.name: {} for each in everyone}
-
-    write_history(everyone)
-
-    def write() -> None:
-        write_flows(everyone, pooled, known)
-        write_regions(everyone, pooled, known)
-        write_demand(everyone, pooled, known)
-
-    write()
-    for past in pasts(everyone):
-        own = known[past.country.name]
-        own |= {"stock_scale": float(past.stock[-1]), "hindcast_collection": past.collection()}
-    write()
-    ids = identifiers(each.name for each in everyone)
-    for country in everyone:
-        flows, _ = simulated(ids[country.name], "default")
-        own, used, scrap = known[country.name], country.flows["into_use"], country.flows["old_scrap"]
-        discards = float(flows["old_scrap"][0] + flows["left"][0])
-        own["net_addition"] = float(used[RECENT].mean()) - discards
-        own["collection"] = min(1.0 - WIDTH, float(scrap[RECENT].mean()) / discards)
-    write()
-    for country in everyone:
-        flows, _ = simulated(ids[country.name], "default")
-        known[country.name]["use"] = flows["goods_to_use"] / flows["goods_to_use"][0]
-    write()
-    for country in everyone:
-        flows, _ = simulated(ids[country.name], "default")
-        exported = sum(flows[arc] for arc in RANGES if arc.endswith("exports") and arc != "scrap_exports")
-        known[country.name]["exports"] = 0.9 * float(np.min(exported))
-    write()
-
-
-def hindcast_lines(found: Sequence[Past]) -> Iterator[str]:
-    """Yield the table of hindcasts."""
-    yield "| country | collected | error 2015–2024 | holding 2014 | within 2000–2014 | |"
-    yield "|-|-|-|-|-|-|"
-    for past in found:
-        errors = [past.error(15, TESTED), past.persistence, past.earlier]
-        said = " | ".join("–" if not np.isfinite(each) else f"{each:.0%}" for each in errors)
-        yield f"| {past.country.name} | {past.collection():.2f} | {said} | {'unreliable' if past.unreliable else ''} |"
-    every = [(each.error(15, TESTED), each.persistence) for each in found]
-    good = [(each.error(15, TESTED), each.persistence) for each in found if not each.unreliable]
-    for what, pairs in (("median of all", every), (f"median of the {len(good)} others", good)):
-        ours, theirs = (float(np.nanmedian(each)) for each in zip(*pairs, strict=True))
-        yield f"| {what} | | {ours:.1%} | {theirs:.1%} | | |"
-
-
 def main() -> None:
-    """Write the data files, or a table of ``docs/data.md`` or ``docs/cycles.md``."""
+    """Write the data files, or the table of plans."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--table", type=Path, default=TABLE, help="the published table of flows")
-    parser.add_argument("--hindcast", action="store_true", help="write the table of hindcasts instead")
     parser.add_argument("--plans", action="store_true", help="write the table of plans instead")
     asked = parser.parse_args()
-    everyone = sorted(countries(read_flows(asked.table)), key=lambda each: each.name)
-    if asked.hindcast:
-        write_sections(DOCUMENT, {"hindcast": "\n".join(hindcast_lines(pasts(everyone)))})
+    everyone = countries(read_flows(asked.table))
     if asked.plans:
         found = identifiers([each.name for each in everyone])
         networks = {name: load_network(f"{ENVS / 'steel.toml'}:{region}") for name, region in found.items()}
         write_sections(CYCLES, {"plans": "\n".join(plan_lines("country", networks, unit=1e3))})
-    if not asked.hindcast and not asked.plans:
-        write_all(everyone)
+        return
+    Files({each.name: Calibration(calibrated(each).level) for each in everyone}, everyone).simulate()
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ import numpy as np
 from benchmarks import steel
 from benchmarks.document import write_sections
 from benchmarks.plans import DOCUMENT as CYCLES
-from benchmarks.steel import ENVS, FUTURE, RECENT, TABLE, YEARS, Country, countries
+from benchmarks.steel import ENVS, FUTURE, TABLE, YEARS, Country, countries
 from cirl_marl import MultiAgentVectorEnv, load_network
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.basic import Arrays, Controller
@@ -49,13 +49,11 @@ SHOWN = 8
 """Countries that the tables of levers and of the plan have."""
 DEGREE = 1
 """Of the test polynomials of the bound."""
-AT = {year: y for y, year in enumerate(YEARS)} | dict.fromkeys(FUTURE, len(YEARS))
-"""Position of each year that files state."""
 
 
 @dataclass(frozen=True, slots=True)
 class Market:
-    """What the countries trade of one good, in 25 years and as the mean of the last five, kt/a."""
+    """What the countries trade of one good in 2000-2024, then from 2025 on as usual, kt/a."""
 
     imports: Annotated[Floats, "of each country, shape (years, countries)"]
     exports: Annotated[Floats, "likewise"]
@@ -82,17 +80,25 @@ class Market:
 def markets(everyone: Sequence[Country]) -> dict[str, Market]:
     """Return the world markets, by good.
 
-    Exports are as the network of each country gives them back, in which processes balance, as rounded ones do not.
+    Exports are as the network of each country gives them back, in which processes balance, as rounded ones do not. From
+    2025 on, what is traded is what it trades there while nobody acts.
     """
     ids = identifiers(each.name for each in everyone)
-    returned = [steel.simulated(ids[each.name], "reported")[0] for each in everyone]
+    returned, usual = (
+        [steel.simulated(ids[each.name], scenario)[0] for each in everyone] for scenario in ("reported", "default")
+    )
     found = {}
     for good in GOODS:
-        imports = np.array([each.flows[f"{good}_imports"] for each in everyone]).T
-        exports = np.array([each[f"{good}_exports"] for each in returned]).T
-        today = [each[RECENT].mean(axis=0) * (good not in RAW) for each in (imports, exports)]
-        found[good] = Market(*(np.vstack(each) for each in zip((imports, exports), today, strict=True)))
+        reported = np.array([each.flows[f"{good}_imports"] for each in everyone]).T
+        imports = np.vstack([reported, _flows(usual, f"{good}_imports") * (good not in RAW)])
+        exports = np.vstack([_flows(each, f"{good}_exports") for each in (returned, usual)])
+        exports[len(YEARS) :] *= good not in RAW
+        found[good] = Market(imports, exports)
     return found
+
+
+def _flows(simulated: Sequence[Mapping[str, Floats]], arc: str) -> Floats:
+    return np.array([flows[arc] for flows in simulated]).T
 
 
 def write_trade(everyone: Sequence[Country], found: Mapping[str, Market], supply: float) -> None:
@@ -100,12 +106,15 @@ def write_trade(everyone: Sequence[Country], found: Mapping[str, Market], supply
     shares = {good: market.shares for good, market in found.items()}
     rows: list[list[object]] = []
     for n, country in enumerate(everyone):
-        for year, y in AT.items():
+        for y, year in enumerate((*YEARS, *FUTURE)):
             rows.append([country.name, year, *(_said(shares[good][y, n]) for good in GOODS)])
     write_table(ENVS / "steel_world.csv", ["region", "year", *GOODS], rows)
     wanted = np.sum([found[good].bought for good in STEEL], axis=0)
-    wanted[-1] = supply
-    rest = [[year, *(_said(found[good].sold[y]) for good in GOODS), _said(wanted[y])] for year, y in AT.items()]
+    wanted[len(YEARS) :] = supply
+    sold = np.array([found[good].sold for good in GOODS]).T
+    rest = [
+        [year, *map(_said, row)] for year, row in zip((*YEARS, *FUTURE), np.column_stack([sold, wanted]), strict=True)
+    ]
     write_table(ENVS / "steel_world_rest.csv", ["year", *GOODS, "supply"], rest)
 
 
@@ -242,7 +251,7 @@ def main() -> None:
     if given.levers:
         write_sections(CYCLES, {"levers": "\n".join(lever_lines())})
         return
-    everyone = sorted(countries(read_flows(TABLE)), key=lambda each: each.name)
+    everyone = countries(read_flows(TABLE))
     found = markets(everyone)
     write_trade(everyone, found, 1.0)
     flows, _ = simulated("default")

@@ -25,7 +25,7 @@ from cirl_marl.testing import check_parallel_env
 @pytest.fixture(scope="module")
 def everyone() -> list[Country]:
     """Return the flows of all countries."""
-    return sorted(countries(read_flows(TABLE)), key=lambda each: each.name)
+    return countries(read_flows(TABLE))
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +104,16 @@ def test_business_as_usual_is_served(world: Network, usual: Rollout, everyone: l
         sold = of(world, usual, [*(f"{each}_{good}_exports" for each in regions), f"rest_of_world_{good}_sold"])
         bought = of(world, usual, [*(f"{each}_{good}_imports" for each in regions), f"rest_of_world_{good}_bought"])
         np.testing.assert_allclose(bought, sold, rtol=1e-9)
+
+
+@pytest.mark.medium
+def test_as_usual_each_country_does_what_it_does_alone(world: Network, usual: Rollout, everyone: list[Country]) -> None:
+    """What the markets give each is what it imports in its own network, which goes on from today."""
+    for region in [*identifiers(each.name for each in everyone).values()][::6]:
+        flows, _ = steel.simulated(region, "default")
+        for arc in ("goods_to_use", "bof_steel", "eaf_steel", "scrap_to_eaf", "flat_imports", "goods_exports"):
+            ours = of(world, usual, [f"{region}_{arc}"])
+            np.testing.assert_allclose(ours, flows[arc], rtol=1e-3, atol=1.0, err_msg=f"{region} {arc}")
 
 
 @pytest.mark.slow
