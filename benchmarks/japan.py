@@ -1,34 +1,39 @@
 """One question answered from end to end, for ``docs/japan.md``: what Japan can do by 2050 to cut ore and losses.
 
-python -m benchmarks.japan               # levers and their order, and how sure it is (a quarter of an hour)
+python -m benchmarks.japan               # levers and their order, and how sure it is (half an hour)
 python -m benchmarks.japan --only later  # some sections, here what to decide now and what later
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.document import write_sections
-from benchmarks.japan_decisions import decisions
+from benchmarks.japan_decisions import decisions, levers_of
+from benchmarks.steel import PRIMARY, TABLE, calibrated, countries, populations, possible_network
 from cirl_marl import Levers, MultiAgentVectorEnv, levers, load_network
 from cirl_marl.controllers import Constant, Neutral
 from cirl_marl.controllers.rollout import episode_start, rollout
+from cirl_marl.evaluation.levers import ROUNDING
 from cirl_marl.evaluation.sampling import sample_episodes, sensitivities
+from cirl_marl.importing.flow_table import read_flows
 from cirl_marl.network import Network
-from cirl_marl.optimum import gap
+from cirl_marl.optimum import bound, gap, improve_plan, simulate_plan
 from cirl_marl.report.decisions import savings
 from cirl_marl.report.lever_chart import save_levers
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "japan.md"
 NAME = "steel_japan"
 SAMPLES = 500
+POSSIBLE = 16
+"""Histories and lifetimes that the data allow, for which levers are pulled."""
 TOGETHER = {"what is exported, steel or goods": ("semis_exports", "long_exports", "flat_exports", "goods_exports")}
 """Agents of one decision: what Japan exports, whatever its form."""
-SECTIONS = ("saved", "levers", "lives", "spread", "later")
+SECTIONS = ("saved", "levers", "ranges", "trade", "lives", "spread", "later")
 """Parts of the document that are measured."""
 ORE = {"ore": ("mining", "ore_imports")}
 """What makes up for what is lacking in the world without shocks, and is a decision where demand is not known."""
@@ -57,6 +62,67 @@ def order(result: Levers) -> Iterator[str]:
     least, most = min(trial.service for trial in trials), max(trial.gap or 0.0 for trial in trials)
     yield ""
     yield f"The lowest service of these {len(trials)} episodes is {least:.4f}, the largest gap to a bound {most:.1%}."
+
+
+def ranges() -> Iterator[str]:
+    """Yield what levers bring with other histories and lifetimes that the data allow."""
+    everyone = countries(read_flows(TABLE))
+    country = next(each for each in everyone if each.name == "Japan")
+    known, people = calibrated(country), populations()["Japan"][2025]
+    facts, alone = dict[str, list[float]](), dict[str, list[float]]()
+    services: list[float] = []
+    for level, stretch in known.draws(POSSIBLE):
+        at = int(np.searchsorted(known.levels, level)), int(np.searchsorted(known.stretches, stretch))
+        facts.setdefault("in use at the end of 2024, t a head", []).append(1e3 * float(known.stock[at]) / people)
+        facts.setdefault("collected today, % of discards", []).append(100 * float(known.collection[at]))
+        network = possible_network(country, everyone, level, stretch)
+        env = MultiAgentVectorEnv(network, num_envs=1)
+        begun = episode_start(env)
+        usual = rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
+        demand = usual.episode_levels[0] - ROUNDING
+        together = simulate_plan(improve_plan(bound(network, min_service=demand)))
+        for what, planned, as_usual in savings(network, together, usual):
+            facts.setdefault(f"{what} as usual, Mt", []).append(as_usual / 1e3)
+            facts.setdefault(f"{what} by the plan, Mt", []).append(planned / 1e3)
+        for name, agents in levers_of(network, TOGETHER).items():
+            run = simulate_plan(improve_plan(bound(network, min_service=demand, agents=agents)))
+            alone.setdefault(name, []).append(float(run.episode_circularity[0] - usual.episode_circularity[0]) / 1e3)
+            services.append(float(run.episode_levels[0].min()))
+    places = {
+        name: [1 + sum(each[i] > own[i] for each in alone.values()) for i in range(POSSIBLE)]
+        for name, own in alone.items()
+    }
+    yield "| what | mean | 90 % of draws | place among levers |"
+    yield "|-|-|-|-|"
+    for name, values in facts.items():
+        yield f"| {name} | {np.mean(values):.1f} | {_span(values)} | |"
+    for name in sorted(alone, key=lambda name: -float(np.mean(alone[name]))):
+        least, most = min(places[name]), max(places[name])
+        place = f"{least}" if least == most else f"{least} to {most}"
+        yield f"| {name}, alone, Mt/a | {np.mean(alone[name]):+.1f} | {_span(alone[name])} | {place} |"
+    yield ""
+    yield f"{POSSIBLE} draws; the lowest service of their episodes is {min(services):.4f}."
+
+
+def _span(values: Sequence[float]) -> str:
+    low, high = np.quantile(values, (0.05, 0.95)).tolist()
+    return f"{low:.1f} to {high:.1f}"
+
+
+def trade() -> Iterator[str]:
+    """Yield how much less primary iron is taken in Japan, and in the world, if Japan keeps its scrap."""
+    world = load_network("steel_world")
+    env = MultiAgentVectorEnv(world, num_envs=1, agents=["japan_scrap_exports"])
+    begun = episode_start(env)
+    controls = (Neutral(), Constant({"japan_scrap_exports": -1.0}))
+    usual, keeps = (rollout(env, each, seed=begun.seed, start=begun.initial_state) for each in controls)
+    primary = [arc.id.endswith(PRIMARY) for arc in world.arcs]
+    japan = [arc.id.startswith("japan_") for arc in world.arcs]
+    saved = (usual.flow - keeps.flow).sum(axis=0) / 1e3
+    own, everywhere = (float(saved[np.logical_and(primary, where)].sum()) for where in (japan, True))
+    exported = float(usual.flow[:, world.arc_index["japan_scrap_exports"]].sum()) / 1e3
+    yield f"As usual Japan exports {exported:.0f} Mt of scrap in 2025–2050 (`steel_world`). If it keeps them, it takes"
+    yield f"{own:.0f} Mt less primary iron, and the world {everywhere:.0f} Mt less: who bought the scrap takes more."
 
 
 def lives() -> Iterator[str]:
@@ -106,6 +172,8 @@ def main() -> None:
         save_levers(DOCUMENT.parent / "pictures" / "japan_levers.png", result)
         parts = {"saved": question(result), "levers": order(result)}
     parts |= {
+        "ranges": ranges(),
+        "trade": trade(),
         "lives": lives(),
         "spread": spread(network),
         "later": decisions(NAME, {**ORE, **TOGETHER}),

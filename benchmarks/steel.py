@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import argparse
 import csv
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import numpy as np
@@ -25,7 +28,7 @@ from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import episode_start, rollout
 from cirl_marl.importing.definition import identifiers, shares_of
 from cirl_marl.importing.flow_table import FlowTable, read_flows
-from cirl_marl.network import Floats
+from cirl_marl.network import Floats, Network
 from cirl_marl.records.files import write_table
 
 ROOT = Path(__file__).parent.parent
@@ -308,7 +311,7 @@ class Files:
         write_table(self.folder / "steel_regions.csv", ["region", *sorted(row)], rows)
 
     def write_demand(self) -> None:
-        """Write population, stock per head, and how much can be collected and saved, from 2025 to 2051."""
+        """Write people, stock per head, what goes into use, what can be collected and saved, from 2025 to 2051."""
         people = populations()
         rows: list[list[object]] = []
         for country in self.countries:
@@ -322,9 +325,10 @@ class Files:
             passed, now, rate = elapsed / 25, today(country, self.pooled), known.collection
             best = rate + passed * (max(rate, BEST_COLLECTION) - rate) + WIDTH * (rate >= BEST_COLLECTION)
             halved = [now[arc] * (1 - passed / 2) for arc in HALVED]
-            for row in zip(years.tolist(), population[1:], head, best, *halved, strict=True):
+            use = now["into_use"] * np.append(known.use, known.use[-1])
+            for row in zip(years.tolist(), population[1:], head, use, best, *halved, strict=True):
                 rows.append([country.name, row[0], *map(_said, row[1:])])
-        header = ["region", "year", "population", "stock_per_head", "collection_most", *HALVED]
+        header = ["region", "year", "population", "stock_per_head", "use", "collection_most", *HALVED]
         write_table(self.folder / "steel_demand.csv", header, rows)
 
     def simulated(self, country: Country, scenario: str = "default") -> tuple[dict[str, Floats], dict[str, Floats]]:
@@ -353,6 +357,23 @@ class Files:
             exported = sum(flows[arc] for arc in RANGES if arc.endswith("exports") and arc != "scrap_exports")
             self.known[country.name].exports = 0.9 * float(np.min(exported))
         self.write()
+
+
+def possible_network(country: Country, everyone: Sequence[Country], level: float, stretch: float) -> Network:
+    """Return the network of a country as it would be with another history before 2000 and other lifetimes."""
+    with TemporaryDirectory() as folder:
+        text = (ENVS / "steel.toml").read_text(encoding="utf-8")
+        (Path(folder) / "steel.toml").write_text(LIFETIME.sub(partial(_stretched, stretch), text), encoding="utf-8")
+        Files({country.name: Calibration(level)}, everyone, Path(folder)).simulate()
+        return load_network(f"{Path(folder) / 'steel.toml'}:{identifiers([country.name])[country.name]}")
+
+
+LIFETIME = re.compile(r"lifetime = \{ mean = ([\d.]+), deviation = ([\d.]+)")
+
+
+def _stretched(stretch: float, found: re.Match[str]) -> str:
+    mean, deviation = (stretch * float(number) for number in found.groups())
+    return f"lifetime = {{ mean = {mean:.9g}, deviation = {deviation:.9g}"
 
 
 WIDTH = 1e-3
