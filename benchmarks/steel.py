@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import argparse
 import csv
-import re
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
@@ -22,7 +21,7 @@ from scipy.interpolate import PchipInterpolator
 from benchmarks.document import write_sections
 from benchmarks.plans import DOCUMENT as CYCLES
 from benchmarks.plans import plan_lines
-from benchmarks.steel_calibration import Posterior, calibrate
+from benchmarks.steel_calibration import Posterior, calibrate, inflow_of
 from cirl_marl import MultiAgentVectorEnv, load_network
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import episode_start, rollout
@@ -119,10 +118,19 @@ SPLITS = {
 """What shares out what enters each process: columns, and where each leads; the first takes the rest."""
 HALVED = ("scrap_losses", "bof_losses", "eaf_losses", "long_scrap", "flat_scrap", "goods_scrap")
 """Shares that can be halved."""
-RANGES = {"scrap_to_bof": (0.5, 1.5), "scrap_exports": (0.0, 1.25)} | dict.fromkeys(
-    ("semis_exports", "long_exports", "flat_exports", "goods_exports"), (0.75, 1.5)
-)
+RANGES = {"scrap_to_bof": (0.5, 1.5), "scrap_exports": (0.0, 1.25)}
 """Shares that agents set, as factors on those of today."""
+EXPORTS = {"semis_exports": "semis_imports", "long_exports": "long_imports"} | {
+    "flat_exports": "flat_imports",
+    "goods_exports": "goods_imports",
+}
+"""Steel that is sold abroad, and what is bought of the same."""
+EXPORTED = (0.75, 1.5)
+"""The shares of it that agents set, as factors on those of as usual."""
+
+
+WIDTH = 1e-3
+"""Least width of a range: an agent has something to set everywhere."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,6 +242,8 @@ class Calibration:
 
     level: float
     """Factor on what went into use before 2000."""
+    stretch: float
+    """Factor on lifetimes."""
     stock_scale: float = 1.0
     """In use at the end of 2024, kt."""
     collection: float = 0.5
@@ -243,6 +253,42 @@ class Calibration:
     """Of steel, the least of what is demanded, kt/a."""
     use: Floats = field(default_factory=lambda: np.ones(len(FUTURE)))
     """What goes into use, 2025 to 2050, as a factor on 2025."""
+
+    def demand(self, people: Mapping[int, float]) -> tuple[Floats, Floats]:
+        """Return people and stock per head, t, at the end of 2025 to 2051."""
+        years = np.array([*FUTURE, FUTURE.stop])
+        population = PchipInterpolator([*people], [*people.values()])(np.append(years[0] - 1, years))
+        # the growth per head that goes on from what goes into use today fades to none in 2050
+        growth = np.log1p(self.net_addition / self.stock_scale) - np.log(population[1] / population[0])
+        fading = np.cumsum(1.0 - np.minimum(years - years[0], 25) / 25)
+        return population[1:], 1e3 * self.stock_scale / population[0] * np.exp(growth * fading)
+
+    def export_shares(self, now: Mapping[str, float]) -> dict[str, Floats]:
+        """Return the shares of exports of steel, 2025 to 2050, at which as much is sold abroad as in 2025.
+
+        Imports follow use. What is rolled follows from the balances of goods, and of long and flat products.
+
+        Args:
+            now: shares and flows of today, by column.
+        """
+        use, sold = now["into_use"] * self.use, {arc: now[arc] for arc in EXPORTS}
+        bought = {arc: now[imports] * self.use for arc, imports in EXPORTS.items()}
+        rolled = {
+            "long_exports": now["semis_to_long"] * (1 - now["long_scrap"]),
+            "flat_exports": (1 - now["semis_to_long"]) * (1 - now["flat_scrap"]),
+        }
+        goods = use[0] * sold["goods_exports"] / (1 - sold["goods_exports"])
+        made = (use + goods - bought["goods_exports"]) / (1 - now["goods_scrap"])
+        staying = {arc: 1 - sold[arc] for arc in rolled}
+        first = made[0] - sum(staying[arc] * bought[arc][0] for arc in rolled)
+        first /= sum(staying[arc] * part for arc, part in rolled.items())
+        products = {arc: sold[arc] * (part * first + bought[arc][0]) for arc, part in rolled.items()}
+        semis = (made + sum(products[arc] - bought[arc] for arc in rolled)) / sum(rolled.values())
+        totals = {arc: part * semis + bought[arc] for arc, part in rolled.items()}
+        slabs = first * sold["semis_exports"] / (1 - sold["semis_exports"])
+        shares = {arc: products[arc] / totals[arc] for arc in rolled}
+        shares |= {"goods_exports": goods / (use + goods), "semis_exports": slabs / (semis + slabs)}
+        return {arc: np.clip(shares[arc], 0.0, 1.0 - WIDTH) for arc in EXPORTS}
 
 
 class Files:
@@ -295,7 +341,7 @@ class Files:
         rows: list[list[object]] = []
         for country in self.countries:
             known = self.known[country.name]
-            row = {name: getattr(known, name) for name in ("collection", "stock_scale", "exports")}
+            row = {name: getattr(known, name) for name in ("collection", "stock_scale", "exports", "stretch")}
             row["flow_scale"] = float(country.flows["into_use"][RECENT].mean())
             primary = country.primary
             parts = primary / primary.sum() if primary.sum() > 0 else np.eye(len(PRIMARY))[1]
@@ -312,23 +358,27 @@ class Files:
 
     def write_demand(self) -> None:
         """Write people, stock per head, what goes into use, what can be collected and saved, from 2025 to 2051."""
-        people = populations()
+        people, years = populations(), np.array([*FUTURE, FUTURE.stop])
         rows: list[list[object]] = []
         for country in self.countries:
-            own, known = people[country.name], self.known[country.name]
-            years = np.array([*FUTURE, FUTURE.stop])
-            population = PchipInterpolator([*own], [*own.values()])(np.append(years[0] - 1, years))
-            # the growth of stock per head that goes on from what goes into use today fades to none in 2050
-            elapsed = np.minimum(years - years[0], 25.0)
-            growth = np.log1p(known.net_addition / known.stock_scale) - np.log(population[1] / population[0])
-            head = 1e3 * known.stock_scale / population[0] * np.exp(growth * np.cumsum(1.0 - elapsed / 25))
+            known = self.known[country.name]
+            population, head = known.demand(people[country.name])
+            elapsed = np.minimum(years - years[0], 25)
             passed, now, rate = elapsed / 25, today(country, self.pooled), known.collection
             best = rate + passed * (max(rate, BEST_COLLECTION) - rate) + WIDTH * (rate >= BEST_COLLECTION)
             halved = [now[arc] * (1 - passed / 2) for arc in HALVED]
-            use = now["into_use"] * np.append(known.use, known.use[-1])
-            for row in zip(years.tolist(), population[1:], head, use, best, *halved, strict=True):
+            exports = known.export_shares(now)
+            ranges = [
+                end
+                for arc in EXPORTS
+                for factor in (EXPORTED[0], 1.0, EXPORTED[1])
+                for end in [np.minimum(factor * exports[arc] + WIDTH * (factor > 1), 1.0)]
+            ]
+            later = [np.append(column, column[-1]) for column in (now["into_use"] * known.use, *ranges)]
+            for row in zip(years.tolist(), population, head, best, *halved, *later, strict=True):
                 rows.append([country.name, row[0], *map(_said, row[1:])])
-        header = ["region", "year", "population", "stock_per_head", "use", "collection_most", *HALVED]
+        header = ["region", "year", "population", "stock_per_head", "collection_most", *HALVED, "use"]
+        header += [f"{arc}_{end}" for arc in EXPORTS for end in ("low", "neutral", "high")]
         write_table(self.folder / "steel_demand.csv", header, rows)
 
     def simulated(self, country: Country, scenario: str = "default") -> tuple[dict[str, Floats], dict[str, Floats]]:
@@ -348,13 +398,18 @@ class Files:
             known.net_addition = float(country.flows["into_use"][RECENT].mean()) - discards
             known.collection = min(1.0 - WIDTH, float(country.flows["old_scrap"][RECENT].mean()) / discards)
         self.write()
+        people = populations()
         for country in self.countries:
-            flows, _ = self.simulated(country)
-            self.known[country.name].use = flows["goods_to_use"] / flows["goods_to_use"][0]
+            known = self.known[country.name]
+            population, head = known.demand(people[country.name])
+            used = np.concatenate([known.level * country.earlier_use, country.flows["into_use"]])
+            growth = population * head / (1e3 * known.stock_scale)
+            use = inflow_of(growth[: len(FUTURE)], used, SECTORS, known.stretch)
+            known.use = use / use[0]
         self.write()
         for country in self.countries:
             flows, _ = self.simulated(country)
-            exported = sum(flows[arc] for arc in RANGES if arc.endswith("exports") and arc != "scrap_exports")
+            exported = sum(flows[arc] for arc in EXPORTS)
             self.known[country.name].exports = 0.9 * float(np.min(exported))
         self.write()
 
@@ -362,22 +417,9 @@ class Files:
 def possible_network(country: Country, everyone: Sequence[Country], level: float, stretch: float) -> Network:
     """Return the network of a country as it would be with another history before 2000 and other lifetimes."""
     with TemporaryDirectory() as folder:
-        text = (ENVS / "steel.toml").read_text(encoding="utf-8")
-        (Path(folder) / "steel.toml").write_text(LIFETIME.sub(partial(_stretched, stretch), text), encoding="utf-8")
-        Files({country.name: Calibration(level)}, everyone, Path(folder)).simulate()
+        shutil.copy(ENVS / "steel.toml", folder)
+        Files({country.name: Calibration(level, stretch)}, everyone, Path(folder)).simulate()
         return load_network(f"{Path(folder) / 'steel.toml'}:{identifiers([country.name])[country.name]}")
-
-
-LIFETIME = re.compile(r"lifetime = \{ mean = ([\d.]+), deviation = ([\d.]+)")
-
-
-def _stretched(stretch: float, found: re.Match[str]) -> str:
-    mean, deviation = (stretch * float(number) for number in found.groups())
-    return f"lifetime = {{ mean = {mean:.9g}, deviation = {deviation:.9g}"
-
-
-WIDTH = 1e-3
-"""Least width of a range: an agent has something to set everywhere."""
 
 
 def _range(arc: str, low: float, neutral: float, high: float) -> dict[str, float]:
@@ -410,7 +452,7 @@ def main() -> None:
         networks = {name: load_network(f"{ENVS / 'steel.toml'}:{region}") for name, region in found.items()}
         write_sections(CYCLES, {"plans": "\n".join(plan_lines("country", networks, unit=1e3))})
         return
-    Files({each.name: Calibration(calibrated(each).level) for each in everyone}, everyone).simulate()
+    Files({each.name: Calibration(*calibrated(each).mode) for each in everyone}, everyone).simulate()
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ since 1900 says the first up to a factor e^a, ODYM's lifetimes the second up to 
 discards, and discards the rate of collection c at which the old scrap that is reported today comes back. The posterior
 of (a, b) is computed on a grid, so that it has no error of sampling::
 
-    p(a, b) ∝ N(a; 0, 0.3²) · N(b; 0, 0.15²) · t₃((c − 0.8)/0.12) · (0.05² + Σ_t ((c·D_t − O_t)/Ō)²/n)^(−n/6)
+    p(a, b) ∝ N(a; 0, 0.3²) · N(b; 0, 0.1²) · t₃((c − 0.8)/0.12) · (0.05² + Σ_t ((c·D_t − O_t)/Ō)²/n)^(−n/6)
 
 with discards D, old scrap O, and its mean Ō over the n years that count. The last factor leaves open how well old scrap
 is known, which differs much from country to country, as it closes the balance of the table. Errors of a year have a
@@ -24,7 +24,7 @@ from scipy.stats import norm, qmc, t
 
 from cirl_marl.network import Floats
 
-LEVEL, STRETCH = 0.3, 0.15
+LEVEL, STRETCH = 0.3, 0.1
 """Standard deviations of the logarithms of what went into use before 2000, and of lifetimes."""
 COLLECTED, WITHIN = 0.8, 0.12
 """Published rates of recycling at the end of life, 0.7 to 0.9 (Pauliuk et al. 2013; UNEP 2011), and their spread."""
@@ -55,10 +55,10 @@ class Posterior:
         return found
 
     @property
-    def level(self) -> float:
-        """The level that is expected where lifetimes are as published."""
-        weights = self.weights[:, POINTS // 2]
-        return float(weights @ self.levels / weights.sum())
+    def mode(self) -> tuple[float, float]:
+        """The most likely level and stretch."""
+        row, column = np.unravel_index(np.argmax(self.weights), self.weights.shape)
+        return float(self.levels[row]), float(self.stretches[column])
 
     def range(self, values: Floats, part: float = 0.9) -> tuple[float, float]:
         """Return the interval with equal tails in which values on the grid lie with a probability of ``part``."""
@@ -81,22 +81,40 @@ class Posterior:
         return found
 
 
-def cohorts(inflow: Floats, sectors: Mapping[str, tuple[float, float]], stretch: float) -> tuple[Floats, Floats]:
-    """Return discards of each year and the stock at its end, of what goes in evenly over a year.
+def survival(years: int, sectors: Mapping[str, tuple[float, float]], stretch: float) -> Floats:
+    """Return what is left at the end of a year, and of those after it, of what goes in evenly over the year.
 
     Args:
-        inflow: kt/a, shape (years,); nothing went in before.
+        years: how many.
         sectors: share and mean lifetime in years of each sector.
         stretch: factor on lifetimes.
     """
-    years = len(inflow)
     ages = np.arange(years)[:, None] + (np.arange(20) + 0.5) / 20
-    survival = sum(
+    parts = [
         share * norm.sf(ages, stretch * mean, RELATIVE_DEVIATION * stretch * mean).mean(axis=1)
         for share, mean in sectors.values()
-    )
-    stock = np.convolve(inflow, survival)[:years]
+    ]
+    found: Floats = np.sum(parts, axis=0)
+    return found
+
+
+def cohorts(inflow: Floats, sectors: Mapping[str, tuple[float, float]], stretch: float) -> tuple[Floats, Floats]:
+    """Return discards of each year and the stock at its end, of what goes in, kt/a, shape (years,); nothing before."""
+    stock = np.convolve(inflow, survival(len(inflow), sectors, stretch))[: len(inflow)]
     return inflow - np.diff(stock, prepend=0.0), stock
+
+
+def inflow_of(
+    growth: Floats, inflow: Floats, sectors: Mapping[str, tuple[float, float]], stretch: float
+) -> Annotated[Floats, "kt/a, shape (years,)"]:
+    """Return what has to go in so that the stock is so many times what it was at the end of what went in before."""
+    left = survival(len(inflow) + len(growth), sectors, stretch)
+    first = len(inflow)
+    stock = growth * cohorts(inflow, sectors, stretch)[1][-1]
+    for year, wanted in enumerate(stock.tolist(), first):
+        kept = float(left[year:0:-1] @ inflow[:year])
+        inflow = np.append(inflow, max(0.0, wanted - kept) / left[0])
+    return inflow[first:]
 
 
 def calibrate(

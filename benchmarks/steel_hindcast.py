@@ -69,8 +69,8 @@ def hindcast(country: Country) -> Hindcast:
 def known_lines(everyone: Sequence[Country]) -> Iterator[str]:
     """Yield the table of what is known of stocks and collection."""
     people = populations()
-    yield "| country | in use, t a head | collected, % of discards | factor on history |"
-    yield "|-|-|-|-|"
+    yield "| country | in use, t a head | collected, % of discards | history, factor | lifetimes, factor |"
+    yield "|-|-|-|-|-|"
     for country in everyone:
         found = calibrated(country)
         head = 1e3 / people[country.name][2025]
@@ -79,7 +79,8 @@ def known_lines(everyone: Sequence[Country]) -> Iterator[str]:
             for values, scale, digits in ((found.stock, head, ".1f"), (found.collection, 100.0, ".0f"))
             for low, high in [found.range(values)]
         )
-        yield f"| {country.name} | {' | '.join(cells)} | {found.level:.2f} |"
+        level, stretch = found.mode
+        yield f"| {country.name} | {' | '.join(cells)} | {level:.2f} | {stretch:.2f} |"
 
 
 def hindcast_lines(found: Sequence[Hindcast]) -> Iterator[str]:

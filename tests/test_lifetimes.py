@@ -39,7 +39,7 @@ from cirl_marl.dynamics.stages import staged_network
 from cirl_marl.evaluation.simulations import simulate
 from cirl_marl.network import Network
 from cirl_marl.network.elements import Lifetime
-from cirl_marl.network.initial_ages import remaining_history
+from cirl_marl.network.initial_ages import age_shares, remaining_history
 from cirl_marl.network.lifetimes import chain_of
 from cirl_marl.report.terminal import law_text, nodes_table
 from cirl_marl.report.trajectory import write_trajectory
@@ -214,6 +214,27 @@ def test_what_has_grown_goes_on_growing(lifetime: Lifetime, growth: float) -> No
             parts = env.physical.stock[env.rows.stages[1], 0]
             long = remaining_history(town(lifetime, grown[560:], history=history).nodes[1], 1.0)
             np.testing.assert_allclose(parts / parts.sum(), long / long.sum(), atol=2e-3)
+
+
+@pytest.mark.parametrize("stretch", [1.4, 0.7, Series(times=(0.0, 30.0), values=(1.4, 1.0))])
+@pytest.mark.parametrize("growth", [None, 0.03])
+def test_what_is_there_has_aged_by_the_stretch_of_the_start(stretch: float | Series, growth: float | None) -> None:
+    """A stretch is a longer lifetime, in the history, too: of stocks, discards, ages and pyramids."""
+    factor = stretch if isinstance(stretch, float) else 1.4
+    past = Series(times=tuple(range(-30, 0)), values=tuple(np.linspace(1.0, 4.0, 30).tolist()))
+    kept = {"history": past, "growth": growth}
+    plain = Lifetime(mean=9.0, deviation=3.0)
+    longer = Lifetime(mean=9.0 * factor, deviation=3.0 * factor)
+    stretched, native = (
+        town(plain, INFLOW[:20], initial=None, stretch=stretch, **kept),
+        town(longer, INFLOW[:20], initial=None, **kept),
+    )
+    for ours, theirs in zip(lived(stretched), lived(native), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-9)
+    nodes = (network.nodes[network.node_index["use"]] for network in (stretched, native))
+    np.testing.assert_allclose(
+        *(age_shares(replace(node, history=None, growth=0.05), 1.0) for node in nodes), rtol=1e-9
+    )
 
 
 def test_stretch_is_a_slower_clock() -> None:

@@ -263,7 +263,9 @@ class Node(Compartment):
     stretch: Annotated[
         Value,
         Positive(
-            "factor on the lifetime of all that is in use; a control of kind ``stretch`` is a further one", varies=True
+            "factor on the lifetime of all that is in use, before the start that of the first interval; a control of "
+            "kind ``stretch`` is a further one",
+            varies=True,
         ),
     ] = 1.0
     history: Annotated[

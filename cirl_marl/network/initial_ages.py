@@ -26,29 +26,35 @@ def remaining_history(node: Node, interval: float) -> Floats:
 
     What enters is spread evenly over each interval before the start. Before the history it had grown by e^(g·t), so
     that the mean of an interval of length h before its first value is e^(−gh) of that, or it was nothing if the node
-    states no ``growth``. Stages begin with the one with most to go, slots
-    with the youngest; after them is what comes out, of which there is none between intervals.
+    states no ``growth``. Lifetimes were those of the first interval, stretch included. Stages begin with the one with
+    most to go, slots with the youngest; after them is what comes out, of which there is none between intervals.
     """
     lifetime, history, growth = node.lifetime, node.history, node.growth
     assert lifetime is not None and history is not None
     if lifetime.chain is None:
         return np.append(past_inflows(node, interval, slots(lifetime, interval)), 0.0)
-    return _remaining_stages(lifetime, history, growth, interval)
+    return _remaining_stages(lifetime.chain, mean_lifetime(node, interval), history, growth, interval)
+
+
+def mean_lifetime(node: Node, interval: float) -> float:
+    """Return the mean lifetime in the first interval, stretch included, which is that of all that entered before."""
+    stretch, lifetime = node.stretch, node.lifetime
+    assert lifetime is not None
+    factor = float(stretch.means(np.array([0.0, interval]))[0]) if isinstance(stretch, Series) else stretch
+    return lifetime.mean * factor
 
 
 @lru_cache(maxsize=1024)  # a network asks several times, and its scenarios do
-def _remaining_stages(lifetime: Lifetime, history: Series, growth: float | None, interval: float) -> Floats:
-    chain = lifetime.chain
-    assert chain is not None
+def _remaining_stages(chain: Chain, mean: float, history: Series, growth: float | None, interval: float) -> Floats:
     edges = np.append(np.arange(history.times[0], -1e-9 * interval, interval), 0.0)
     stages = np.zeros(chain.stages)
     if growth is not None:
-        stages = chain.growing_stock(growth * lifetime.mean) * _first(history, growth, interval) * lifetime.mean
-    whole = propagator(chain, interval / lifetime.mean)
+        stages = chain.growing_stock(growth * mean) * _first(history, growth, interval) * mean
+    whole = propagator(chain, interval / mean)
     for begin, end, inflow in zip(edges[:-1], edges[1:], history.means(edges), strict=True):
         shorter = end - begin < interval * (1 - 1e-9)
-        transition, gain = propagator(chain, (end - begin) / lifetime.mean) if shorter else whole
-        stages = transition @ stages + gain * inflow * lifetime.mean
+        transition, gain = propagator(chain, (end - begin) / mean) if shorter else whole
+        stages = transition @ stages + gain * inflow * mean
     stages.flags.writeable = False
     return stages
 
@@ -63,7 +69,7 @@ def age_shares(node: Node, interval: float) -> Floats:
     if node.history is not None:
         parts = remaining_history(node, interval)
     elif lifetime.chain is not None:
-        parts = lifetime.chain.growing_stock(growth * lifetime.mean)
+        parts = lifetime.chain.growing_stock(growth * mean_lifetime(node, interval))
     else:
         parts = np.append(np.exp(-growth * interval * np.arange(slots(lifetime, interval))), 0.0)
     return np.asarray(parts / parts.sum())
@@ -122,13 +128,13 @@ def age_problems(node: Node, interval: float) -> Iterator[str]:
     """Yield why the ages of a node's initial stock cannot be told."""
     lifetime, history = node.lifetime, node.history
     assert lifetime is not None
-    chain, growth = lifetime.chain, node.growth or 0.0
-    if abs(growth) * max(lifetime.mean, interval) > STEEPEST:
-        yield f"growth {growth:g}: in a lifetime of {lifetime.mean:g} it makes too much of nothing; is it in percent?"
-    elif chain is not None and node.growth is not None and node.growth * lifetime.mean <= -chain.rate:
+    chain, growth, mean = lifetime.chain, node.growth or 0.0, mean_lifetime(node, interval)
+    if abs(growth) * max(mean, interval) > STEEPEST:
+        yield f"growth {growth:g}: in a lifetime of {mean:g} it makes too much of nothing; is it in percent?"
+    elif chain is not None and node.growth is not None and node.growth * mean <= -chain.rate:
         yield (
-            f"growth {node.growth:g}: no stock has a lifetime of {lifetime.mean:g} and shrinks so fast; it must be "
-            f"above {-chain.rate / lifetime.mean:.4g}"
+            f"growth {node.growth:g}: no stock has a lifetime of {mean:g} and shrinks so fast; it must be "
+            f"above {-chain.rate / mean:.4g}"
         )
     elif history is not None and remaining_history(node, interval).sum() <= 0:
         yield "history: nothing is left of it at the start of the episode"
