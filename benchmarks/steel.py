@@ -1,7 +1,7 @@
 """The data of ``envs/steel.toml``, and what was measured with it; ``docs/data.md`` has the sources.
 
 python -m benchmarks.steel          # writes envs/steel.csv, steel_history, steel_regions and steel_demand anew
-python -m benchmarks.steel --plans  # bounds and plans of every country, in docs/cycles.md (half an hour)
+python -m benchmarks.steel --plans  # kept bounds and plans of every country (benchmarks.best_plans), in docs/cycles.md
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import csv
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,9 +18,9 @@ from typing import Annotated
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from benchmarks.best_plans import read_plan, replayed
 from benchmarks.document import write_sections
 from benchmarks.plans import DOCUMENT as CYCLES
-from benchmarks.plans import plan_lines
 from benchmarks.steel_calibration import Posterior, calibrate, inflow_of
 from cirl_marl import MultiAgentVectorEnv, load_network
 from cirl_marl.controllers import Neutral
@@ -28,6 +28,7 @@ from cirl_marl.controllers.rollout import episode_start, rollout
 from cirl_marl.importing.definition import identifiers, shares_of
 from cirl_marl.importing.flow_table import FlowTable, read_flows
 from cirl_marl.network import Floats, Network
+from cirl_marl.optimum import gap
 from cirl_marl.records.files import write_table
 
 ROOT = Path(__file__).parent.parent
@@ -440,6 +441,19 @@ def simulated(region: str, scenario: str, folder: Path = ENVS) -> tuple[dict[str
     return flows, {node.id: run.stock[:, i] for i, node in enumerate(network.stores)}
 
 
+def plan_lines(everyone: Sequence[Country]) -> Iterator[str]:
+    """Yield the table of bounds and plans, as they are kept."""
+    yield "| country | as usual, Mt | bound, Mt | plan, Mt | gap | service |"
+    yield "|-|-|-|-|-|-|"
+    for name, region in identifiers(each.name for each in everyone).items():
+        kept = read_plan(f"steel_{region}")
+        assert kept.bound is not None
+        episode = replayed(kept)
+        usual, found = (float(run.episode_circularity[0]) for run in (episode.usual, episode.rollout))
+        figures = " | ".join(f"{value / 1e3:.2f}" for value in (usual, kept.bound, found))
+        yield f"| {name} | {figures} | {float(gap(kept.bound, found)):.2%} | {kept.min_service:.4f} |"
+
+
 def main() -> None:
     """Write the data files, or the table of plans."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -448,9 +462,7 @@ def main() -> None:
     asked = parser.parse_args()
     everyone = countries(read_flows(asked.table))
     if asked.plans:
-        found = identifiers([each.name for each in everyone])
-        networks = {name: load_network(f"{ENVS / 'steel.toml'}:{region}") for name, region in found.items()}
-        write_sections(CYCLES, {"plans": "\n".join(plan_lines("country", networks, unit=1e3))})
+        write_sections(CYCLES, {"plans": "\n".join(plan_lines(everyone))})
         return
     Files({each.name: Calibration(*calibrated(each).mode) for each in everyone}, everyone).simulate()
 

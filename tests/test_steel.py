@@ -242,9 +242,9 @@ def test_nothing_that_is_imported_is_free() -> None:
             "scales.stock: cannot change in time; fix the time, too, in 'where'",
         ),
         (
-            'deviation = "15 %"',
-            'deviation = "15"',
-            "stretch.deviation: must be a number in the unit of the quantity, or relative, as '5 %', got '15'",
+            'deviation = "10 %"',
+            'deviation = "10"',
+            "stretch.deviation: must be a number in the unit of the quantity, or relative, as '5 %', got '10'",
         ),
     ],
 )

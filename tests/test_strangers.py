@@ -322,7 +322,7 @@ def test_a_missing_file_is_all_that_is_told(tmp_path: Path) -> None:
     lines = str(refused.value).splitlines()
     assert [re.findall("'(steel.*?csv)': is not there", line) for line in lines] == [
         ["steel_regions.csv"],
-        ["steel.csv"],
+        ["steel_history.csv"],
     ]
 
 

@@ -176,7 +176,7 @@ def test_files_state_it(tmp_path: Path) -> None:
     assert network.uncertain["arcs.dross.share"] == Spread(low=0.5, high=1.5, distribution="uniform")
     assert network.uncertain["services.supply.low"].deviation == pytest.approx(0.05)
     relative = load_network("steel_japan").uncertain
-    assert relative["nodes.vehicles.stretch"] == Spread(deviation=0.15)
+    assert relative["nodes.vehicles.stretch"] == Spread(deviation=0.1)
     assert relative["services.steel_in_use.low"].deviation == pytest.approx(0.05)
     write_network(network, tmp_path / "again.toml")
     again = load_network(str(tmp_path / "again.toml"))

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cirl_marl.controllers.indicators import indicators
 from cirl_marl.controllers.rollout import EpisodeStart, Rollout
 from cirl_marl.dynamics.laws import LAWS
 from cirl_marl.network import Network
@@ -22,7 +23,7 @@ NOTABLE = 1e-3
 
 
 def outcome_lines(network: Network, run: Rollout, origin: EpisodeStart) -> list[str]:
-    """Return where the first episode of a rollout began, λ̄ and service levels, and which flows and services lacked.
+    """Return where the first episode of a rollout began, λ̄, services, indicators, and which flows and services lacked.
 
     A network that states the criticality of its material has its time-window circularity as well.
     """
@@ -34,7 +35,8 @@ def outcome_lines(network: Network, run: Rollout, origin: EpisodeStart) -> list[
     if len(network.services) > 1:
         levels = zip(network.services, run.episode_levels[0].tolist(), strict=True)
         lines.append(f"service levels: {', '.join(f'{service.id} {level:.4f}' for service, level in levels)}")
-    return [*lines, *shortage_lines(network, run)]
+    found = indicators(network, run.flow.mean(axis=0))
+    return [*lines, *([found.text(network)] if found else []), *shortage_lines(network, run)]
 
 
 def shortage_lines(network: Network, run: Rollout) -> list[str]:

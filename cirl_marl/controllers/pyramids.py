@@ -11,7 +11,7 @@ from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Node
-from cirl_marl.network.initial_ages import mean_lifetime, past_inflows, propagator, slots
+from cirl_marl.network.initial_ages import past_inflows, propagator, slots
 from cirl_marl.network.lifetimes import Chain
 
 OLD = 1e-4
@@ -81,8 +81,8 @@ def _of_chain(node: Node, chain: Chain, interval: float, inflow: Floats, start: 
     def transition(factor: float) -> tuple[Floats, Floats]:
         return propagator(chain, interval / (mean * factor))
 
-    count = _age_classes(chain, interval / mean / max(1.0, float(stretch.max())))
-    survival, entry = transition(mean_lifetime(node, interval) / mean)
+    count = _age_classes(chain, interval / mean / max(1.0, node.history_stretch, float(stretch.max())))
+    survival, entry = transition(node.history_stretch)
     stages, cohorts = entry, np.zeros((chain.stages, count))
     for age, mass in enumerate(past_inflows(node, interval, count)):
         cohorts[:, age] = stages * mass

@@ -6,9 +6,11 @@ import hashlib
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from cirl_marl.controllers.indicators import indicators
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.definitions.writer import fingerprint
 from cirl_marl.environments.vector import MultiAgentVectorEnv
@@ -39,8 +41,9 @@ def summary(env: MultiAgentVectorEnv, rollouts: Mapping[str, Rollout]) -> dict[s
     """Return the figures of each controller beside those of ``neutral``, ready for JSON.
 
     Each figure is a mean over episodes with its 95 % confidence interval; gains are paired, episode by episode, with
-    the neutral controller's from the same start. What is ``worst`` is the mean of the 5 % worst episodes. A network
-    that states the criticality of its material has its time-window circularity as well (see ``time_window``).
+    the neutral controller's from the same start. What is ``worst`` is the mean of the 5 % worst episodes. Indicators
+    are those of the mean flows. A network that states the criticality of its material has its time-window circularity
+    as well (see ``time_window``).
     """
     neutral = rollouts["neutral"]
     figures = {}
@@ -56,6 +59,8 @@ def summary(env: MultiAgentVectorEnv, rollouts: Mapping[str, Rollout]) -> dict[s
             "return": _by_agent(env, run.returns),
             "local_return": _by_agent(env, run.local_returns),
         }
+        if found := indicators(env.network, run.mean_flow):
+            figures[name]["indicators"] = asdict(found)
         if env.network.objective.criticality is not None:
             figures[name]["time_window_circularity"] = over_episodes(time_window(env.network, run)).as_dict()
     return {"unit": env.network.mass_unit, "episodes": env.num_envs, "controllers": figures}

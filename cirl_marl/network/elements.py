@@ -263,10 +263,11 @@ class Node(Compartment):
     stretch: Annotated[
         Value,
         Positive(
-            "factor on the lifetime of all that is in use, before the start that of the first interval; a control of "
-            "kind ``stretch`` is a further one",
-            varies=True,
+            "factor on the lifetime of all that is in use; a control of kind ``stretch`` is a further one", varies=True
         ),
+    ] = 1.0
+    history_stretch: Annotated[
+        float, Positive("factor on the lifetime before the episode, from which the ages of the initial stock follow")
     ] = 1.0
     history: Annotated[
         Series | None,

@@ -26,22 +26,20 @@ def remaining_history(node: Node, interval: float) -> Floats:
 
     What enters is spread evenly over each interval before the start. Before the history it had grown by e^(g·t), so
     that the mean of an interval of length h before its first value is e^(−gh) of that, or it was nothing if the node
-    states no ``growth``. Lifetimes were those of the first interval, stretch included. Stages begin with the one with
-    most to go, slots with the youngest; after them is what comes out, of which there is none between intervals.
+    states no ``growth``. Stages begin with the one with most to go, slots with the youngest; after them is what comes
+    out, of which there is none between intervals.
     """
     lifetime, history, growth = node.lifetime, node.history, node.growth
     assert lifetime is not None and history is not None
     if lifetime.chain is None:
         return np.append(past_inflows(node, interval, slots(lifetime, interval)), 0.0)
-    return _remaining_stages(lifetime.chain, mean_lifetime(node, interval), history, growth, interval)
+    return _remaining_stages(lifetime.chain, earlier_lifetime(node), history, growth, interval)
 
 
-def mean_lifetime(node: Node, interval: float) -> float:
-    """Return the mean lifetime in the first interval, stretch included, which is that of all that entered before."""
-    stretch, lifetime = node.stretch, node.lifetime
-    assert lifetime is not None
-    factor = float(stretch.means(np.array([0.0, interval]))[0]) if isinstance(stretch, Series) else stretch
-    return lifetime.mean * factor
+def earlier_lifetime(node: Node) -> float:
+    """Return the mean lifetime before the episode."""
+    assert node.lifetime is not None
+    return node.lifetime.mean * node.history_stretch
 
 
 @lru_cache(maxsize=1024)  # a network asks several times, and its scenarios do
@@ -69,7 +67,7 @@ def age_shares(node: Node, interval: float) -> Floats:
     if node.history is not None:
         parts = remaining_history(node, interval)
     elif lifetime.chain is not None:
-        parts = lifetime.chain.growing_stock(growth * mean_lifetime(node, interval))
+        parts = lifetime.chain.growing_stock(growth * earlier_lifetime(node))
     else:
         parts = np.append(np.exp(-growth * interval * np.arange(slots(lifetime, interval))), 0.0)
     return np.asarray(parts / parts.sum())
@@ -128,7 +126,7 @@ def age_problems(node: Node, interval: float) -> Iterator[str]:
     """Yield why the ages of a node's initial stock cannot be told."""
     lifetime, history = node.lifetime, node.history
     assert lifetime is not None
-    chain, growth, mean = lifetime.chain, node.growth or 0.0, mean_lifetime(node, interval)
+    chain, growth, mean = lifetime.chain, node.growth or 0.0, earlier_lifetime(node)
     if abs(growth) * max(mean, interval) > STEEPEST:
         yield f"growth {growth:g}: in a lifetime of {mean:g} it makes too much of nothing; is it in percent?"
     elif chain is not None and node.growth is not None and node.growth * mean <= -chain.rate:

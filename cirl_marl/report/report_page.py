@@ -9,6 +9,7 @@ from typing import Annotated
 import numpy as np
 from scipy.special import stdtrit
 
+from cirl_marl.controllers.indicators import indicators
 from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.controllers.schedule import Schedule
 from cirl_marl.drawing.style import readable
@@ -230,6 +231,9 @@ def _episode(
         "circularity": over_episodes(outcome.episode_circularity),
         "service": over_episodes(outcome.episode_service, SHARE),
     }
+    found = indicators(network, outcome.mean_flow)
+    shares = {"recycling_rate": found.recycling_rate, "recycled_content": found.recycled_content} if found else {}
+    figures = {**figures, **{which: Aggregate(share, np.nan, np.nan) for which, share in shares.items()}}
     return PageEpisode(
         name=name,
         network=network,

@@ -114,7 +114,7 @@ def lifetime_problems(network: Specification, node: Node, arcs: Sequence[Arc]) -
     """Yield what does not go with a lifetime that a node has or has not; ``arcs`` are those that enter or leave it."""
     prefix, kind = f"node '{node.id}': ", node.control.kind if node.control else None
     if node.lifetime is None:
-        for name in ("stretch", "history", "growth"):
+        for name in ("stretch", "history_stretch", "history", "growth"):
             if getattr(node, name) != default_of(Node, name):
                 yield f"{prefix}{name}: it has no lifetime; give it one, or leave this out"
         if kind is ControlKind.STRETCH:
@@ -130,7 +130,8 @@ def lifetime_problems(network: Specification, node: Node, arcs: Sequence[Arc]) -
     yield from _end_problems(node, arcs)
     mistakes = [*bound_problems(node.lifetime, f"{prefix}lifetime.")]
     mistakes = mistakes or [f"{prefix}lifetime.{fault}" for fault in _spread_problems(network, node.lifetime)]
-    if node.lifetime.distribution == FIXED_LIFETIME and (kind is ControlKind.STRETCH or node.stretch != 1.0):
+    stretches = kind is ControlKind.STRETCH or node.stretch != 1.0 or node.history_stretch != 1.0
+    if node.lifetime.distribution == FIXED_LIFETIME and stretches:
         mistakes.append(f"{prefix}stretch: a fixed lifetime has none; give it a distribution and a small deviation")
     yield from mistakes
     if not mistakes and not [*bound_problems(node)]:

@@ -58,6 +58,8 @@ export function outcomeOf(story) {
     service: ["service level", percent],
     bound: [`bound / ${story.mass}`, figure],
     gap: ["gap to the bound", percent],
+    recycling_rate: ["end-of-life recycling rate", percent],
+    recycled_content: ["recycled content", percent],
   };
   const there = Object.keys(forms).filter((which) => story.scenes.some((scene) => scene.figures[which]));
   if (!there.length) return;
