@@ -221,7 +221,7 @@ def test_what_has_grown_goes_on_growing(lifetime: Lifetime, growth: float) -> No
 def test_a_stretch_of_history_and_episode_is_a_longer_lifetime(stretch: float, growth: float | None) -> None:
     """Of stocks, discards, ages and pyramids; a stretch from the start on leaves the ages that there are."""
     past = Series(times=tuple(range(-30, 0)), values=tuple(np.linspace(1.0, 4.0, 30).tolist()))
-    kept = {"history": past, "growth": growth}
+    kept: dict[str, Any] = {"history": past, "growth": growth}
     plain = Lifetime(mean=9.0, deviation=3.0)
     longer = Lifetime(mean=9.0 * stretch, deviation=3.0 * stretch)
     inflow = INFLOW[:20]
@@ -234,8 +234,8 @@ def test_a_stretch_of_history_and_episode_is_a_longer_lifetime(stretch: float, g
     )
     np.testing.assert_allclose(ours_.mean_age, theirs_.mean_age, rtol=1e-4)
     use, other = (network.nodes[network.node_index["use"]] for network in (stretched, native))
-    grown = [age_shares(replace(node, history=None, growth=0.05), 1.0) for node in (use, other)]
-    np.testing.assert_allclose(*grown, rtol=1e-9)
+    grown, longer_grown = (age_shares(replace(node, history=None, growth=0.05), 1.0) for node in (use, other))
+    np.testing.assert_allclose(grown, longer_grown, rtol=1e-9)
     later = town(plain, inflow, initial=None, stretch=stretch, **kept)
     np.testing.assert_array_equal(later.initial, town(plain, inflow, initial=None, **kept).initial)
 

@@ -105,7 +105,7 @@ def test_as_usual_goes_on_from_today(network: str, everyone: list[Country]) -> N
     ):
         ours = sum((flows[arc] for arc in arcs), np.zeros(26))
         mean = sum(float(reported[arc][RECENT].mean()) for arc in columns or arcs)
-        np.testing.assert_allclose(ours[0], mean, rtol=0.02, atol=1.0, err_msg=str(arcs))
+        np.testing.assert_allclose(ours[0], mean, rtol=0.03, atol=1.0, err_msg=str(arcs))
         if arcs != ["pig_iron_made"]:  # which closes the balance, and ends where scrap suffices
             assert np.abs(np.diff(ours)).max() <= 0.1 * ours.mean() + 1.0, arcs
     use = flows["goods_to_use"] / flows["goods_to_use"][0]
@@ -197,13 +197,7 @@ def test_business_as_usual_is_served(network: str, everyone: list[Country]) -> N
     begun = episode_start(env)
     run = rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
     flow = {arc.id: run.flow[:, k] for k, arc in enumerate(found.arcs)}
-    short = (run.levels[0] < 1 - 1e-6).any(axis=0)
-    for arc in PRIMARY:  # something lacks only where all that is ever drawn on gives its most, as in Spain and Thailand
-        most = found.control_bounds[2, found.control_rows[arc].start]
-        if found.arcs[found.arc_index[arc]].weight:
-            np.testing.assert_allclose(flow[arc][short], most[short], rtol=1e-9)
-    assert run.levels.min() > 0.99
-    assert not short.any() or network in ("steel_spain", "steel_thailand")
+    assert run.levels.min() > 1 - 1e-6
     primary = sum((flow[arc] for arc in PRIMARY), np.zeros(26))
     lost = sum((flow[arc.id] for arc in found.arcs if arc.recipient in ("losses", "uncollected")), np.zeros(26))
     np.testing.assert_allclose(run.circularity_mean[0], -(primary + lost), rtol=1e-9)

@@ -1,0 +1,104 @@
+"""Cycles of the world against what is published of single years: a table of docs/data.md.
+
+python -m benchmarks.published
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated
+
+from benchmarks.document import write_sections
+from benchmarks.steel import DOCUMENT
+from cirl_marl import simulate
+from cirl_marl.evaluation.simulations import Simulation
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """What is published of a flow."""
+
+    network: str
+    name: str
+    arcs: Annotated[tuple[str, ...], "whose sum it is; a name that begins with * stands for all that end in the rest"]
+    values: Annotated[Mapping[int, float], "Mt/a by year"]
+    source: str
+    difference: Annotated[str, "why the model has another"]
+
+
+FIGURES = (
+    Figure(
+        "copper_world",
+        "mined",
+        ("mining",),
+        {2015: 19.1, 2019: 20.5, 2022: 21.9},
+        "ICSG, World Copper Factbook 2020, 2023",
+        "use and scrap are those of Fraunhofer ISI, whose balance needs more ore than is mined",
+    ),
+    Figure(
+        "aluminium_world",
+        "primary",
+        ("mining",),
+        {2019: 63.7, 2022: 68.5},
+        "IAI, Primary Aluminium Production",
+        "alloying metal counts here",
+    ),
+    Figure(
+        "aluminium_world",
+        "old scrap",
+        ("*_collected",),
+        {2019: 20.0},
+        "IAI, press release of 25 May 2021",
+        "before losses in remelting",
+    ),
+    Figure(
+        "plastics_world",
+        "into use",
+        ("into_use",),
+        {2020: 450.0},
+        "OECD 2022 and 2023: 460 in 2019, 2.2 % less in 2020",
+        "the OECD's baseline on a straight line, without the pandemic",
+    ),
+    Figure(
+        "plastics_world",
+        "made, without fibres",
+        ("virgin", "recycled", "-to_textiles"),
+        {2022: 400.3},
+        "Plastics Europe, Plastics: the fast Facts 2023",
+        "likewise, and other polymers are counted",
+    ),
+)
+
+
+def modelled(figure: Figure, simulation: Simulation, year: int) -> float:
+    """Return the model's value of a year, Mt/a."""
+    network, total = simulation.network, 0.0
+    calendar_start = network.episode.start
+    assert calendar_start is not None
+    step = year - int(float(str(calendar_start)))
+    for name in figure.arcs:
+        sign, wanted = (-1.0, name[1:]) if name.startswith("-") else (1.0, name)
+        chosen = [
+            k
+            for k, arc in enumerate(network.arcs)
+            if arc.id == wanted or (wanted[0] == "*" and arc.id.endswith(wanted[1:]))
+        ]
+        total += sign * float(simulation.rollout.flow[step, chosen].sum())
+    return total
+
+
+def lines() -> Iterator[str]:
+    """Yield the table."""
+    yield "| cycle | what | year | published, Mt/a | here, Mt/a | off | source | difference |"
+    yield "|-|-|-|-|-|-|-|-|"
+    simulations = {name: simulate(name) for name in dict.fromkeys(figure.network for figure in FIGURES)}
+    for figure in FIGURES:
+        for year, value in figure.values.items():
+            ours = modelled(figure, simulations[figure.network], year)
+            off = f"{value:.1f} | {ours:.1f} | {ours / value - 1:+.0%}"
+            yield f"| `{figure.network}` | {figure.name} | {year} | {off} | {figure.source} | {figure.difference} |"
+
+
+if __name__ == "__main__":
+    write_sections(DOCUMENT, {"published": "\n".join(lines())})
