@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cirl_marl import MultiAgentVectorEnv, Network, load_network, simulate
 from cirl_marl.controllers import Neutral
-from cirl_marl.controllers.indicators import LOST, Indicators, indicators
+from cirl_marl.controllers.indicators import Indicators, indicators
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.evaluation.figures import summary
 from cirl_marl.network import Floats
@@ -25,6 +25,7 @@ ENDS = {
     "recycled": ("sorting", "goods"),
     "rejected": ("sorting", "dump"),
     "sold": ("sorting", "abroad"),
+    "dug": ("dump", "goods"),
 }
 
 
@@ -51,7 +52,7 @@ def cycle() -> Network:
 
 def found(flows: dict[str, float]) -> Indicators:
     """Return the indicators of flows of the cycle."""
-    result = indicators(cycle(), np.array([flows[id_] for id_ in ENDS]))
+    result = indicators(cycle(), np.array([flows.get(id_, 0.0) for id_ in ENDS]))
     assert result is not None
     return result
 
@@ -75,10 +76,18 @@ def test_what_a_store_keeps_is_not_lost() -> None:
     np.testing.assert_allclose([result.recycled_content, result.primary_content], [0.3, 0.4])
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_a_walk_along_the_flows_ends_where_they_say(seed: int) -> None:
-    """Random flows of copper_net, which has loops: mass is followed step by step, forwards and backwards."""
-    network = load_network("copper_net")
+def test_what_is_dug_out_of_a_dump_was_lost() -> None:
+    """It ends there, whatever becomes of it later; where it comes back it was in use before."""
+    result = found({**BALANCED, "dug": 2.0, "mined": 2.0})
+    np.testing.assert_allclose([result.losses, result.recycling_rate], [3.0, 0.7])
+    np.testing.assert_allclose([result.recycled_content, result.primary_content], [0.8, 0.2])
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("name", ["copper_net", "paper_city"])
+def test_a_walk_along_the_flows_ends_where_they_say(name: str, seed: int) -> None:
+    """Random flows of networks that have loops: mass is followed step by step, forwards and backwards."""
+    network = load_network(name)
     flow = np.random.default_rng(seed).uniform(0.0, 5.0, len(network.arcs))
     result = indicators(network, flow)
     assert result is not None
@@ -86,8 +95,9 @@ def test_a_walk_along_the_flows_ends_where_they_say(seed: int) -> None:
     matrix = np.zeros((size, size))
     np.add.at(matrix, (network.donors, network.recipients), flow)
     use = np.zeros(size, dtype=bool)
-    use[[network.node_index[service.provider] for service in network.services if service.quantity == "stock"]] = True
-    lost = np.array([node.role in LOST for node in network.nodes])
+    served = {service.provider for service in network.services if service.quantity == "stock"} & {*network.node_index}
+    use[[network.node_index[each] for each in served]] = True
+    lost = np.array([node.role in {Role.LANDFILL, Role.INCINERATOR, Role.ENVIRONMENT} for node in network.nodes])
     primary = np.array([node.role is Role.NONRENEWABLE_RESERVOIR for node in network.nodes])
     through = np.maximum(matrix.sum(axis=0), matrix.sum(axis=1))
 

@@ -456,6 +456,12 @@ OTHER = Arc(id="other", donor="use", recipient="dump", rate=0.1)
         ({"node": {"growth": -2.0}, "distribution": "fixed", "deviation": None, "mean": 60.0}, (), r"is it in percent"),
         ({"node": {"growth": -3.0}}, (), r"growth -3: no stock has a lifetime of 9 and shrinks so fast"),
         ({"node": {"lifetime": None, "rate": 0.1, "stretch": 2.0}}, (), r"stretch: it has no lifetime"),
+        ({"node": {"lifetime": None, "rate": 0.1, "history_stretch": 2.0}}, (), r"history_stretch: it has no lifetime"),
+        (
+            {"distribution": "fixed", "deviation": None, "node": {"history_stretch": 2.0}},
+            (),
+            r"stretch: a fixed lifetime has none",
+        ),
         ({"node": {"initial": None}}, (), r"initial: missing"),
         ({}, (BUY, DISCARD, OTHER), r"arc 'other': law 'donor': its donor 'use' has a lifetime"),
         ({}, (BUY,), r"lifetime: no arc leaves it"),
