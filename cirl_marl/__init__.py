@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from cirl_marl.controllers.basic import Controller as Controller
     from cirl_marl.controllers.basic import Neutral as Neutral
     from cirl_marl.controllers.basic import Random as Random
+    from cirl_marl.controllers.indicators import Indicators as Indicators
+    from cirl_marl.controllers.indicators import indicators as indicators
     from cirl_marl.controllers.lqr import LQR as LQR
     from cirl_marl.controllers.rollout import Rollout as Rollout
     from cirl_marl.controllers.rollout import interval_ends as interval_ends
@@ -117,6 +119,7 @@ __version__ = "0.1.0"
 _MODULES = {
     "adapters.differentiable": "DifferentiableEnv",
     "controllers.basic": "Constant Controller Neutral Random",
+    "controllers.indicators": "Indicators indicators",
     "controllers.lqr": "LQR",
     "controllers.rollout": "Rollout interval_ends rollout",
     "controllers.schedule": "Schedule",
