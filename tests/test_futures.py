@@ -54,7 +54,7 @@ def assert_alike(future: Future, programs: Programs, stock: np.ndarray, interval
 
 
 @pytest.mark.medium
-@pytest.mark.sample(2)
+@pytest.mark.sample(1)
 @pytest.mark.parametrize(("network", "scenario"), WORLDS)
 @pytest.mark.parametrize("count", [None, 2])
 def test_programs_are_those_of_each_copy_alone(network: str, scenario: str, count: int | None) -> None:

@@ -39,6 +39,7 @@ def test_bounds_are_above_plans(bottles: Network, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_trainings_are_kept(bottles: Network, tmp_path: Path) -> None:
     """Every weight is trained once; the second time nothing is, and the figures are the same."""
     found = swept(bottles, tmp_path)

@@ -524,6 +524,7 @@ def test_fast_stocks_and_strong_loops(hoarded: float, merged: bool, style: str) 
     assert layout.pieces == (1 if merged else 24)
 
 
+@pytest.mark.slow
 def test_merged_pieces_are_as_tight() -> None:
     """One piece for an interval of 24 substeps proves nearly what 24 pieces prove, with a tenth of the variables."""
     admissible = Admissible.of(cycle(hoarded=500.0))

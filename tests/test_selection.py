@@ -102,6 +102,7 @@ def test_without_evaluations_the_last_checkpoint_acts(tmp_path: Path) -> None:
         assert path.read_bytes() == (other.checkpoint / path.name).read_bytes()
 
 
+@pytest.mark.slow
 def test_the_best_survives_a_resumption(tmp_path: Path) -> None:
     """A run that goes on keeps its best until there is a better one; rows go on, none twice."""
     run = learnt(tmp_path / "run", recipe(min_service=1.0))

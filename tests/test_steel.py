@@ -72,7 +72,7 @@ def test_what_is_reported_comes_back(network: str, everyone: list[Country]) -> N
         np.testing.assert_allclose(values, reported[arc], rtol=0, atol=0.003, err_msg=arc)
 
 
-@pytest.mark.sample(6)
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("network", NETWORKS)
 def test_the_data_files_are_of_the_table(network: str, everyone: list[Country], tmp_path: Path) -> None:
     """Written again from the published tables, for one country alone, they are the same."""
@@ -91,7 +91,7 @@ def test_the_data_files_are_of_the_table(network: str, everyone: list[Country], 
 
 
 @pytest.mark.medium
-@pytest.mark.sample(6)
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("network", NETWORKS)
 def test_as_usual_goes_on_from_today(network: str, everyone: list[Country]) -> None:
     """Steel, pig iron, scrap and use of 2025 are those of 2020-2024, and nothing jumps afterwards."""

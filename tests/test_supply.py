@@ -367,6 +367,7 @@ def test_copies_are_lone_environments(network: Network) -> None:
             np.testing.assert_array_equal(infos[acting[0]]["flows"], flows[:, i])
 
 
+@pytest.mark.slow
 def test_bounds_allow_all_that_may_be_supplied() -> None:
     """An idle supply may be any amount in the program; its plan is carried out with what is supplied then."""
     network = replace(cycle("lifetimes"), default_agents=("old_scrap",))

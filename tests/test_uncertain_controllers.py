@@ -251,7 +251,7 @@ def test_blind_actions_do_not_look() -> None:
         assert isinstance(policy, BestSchedule) or len(np.unique(policy.actions, axis=0)) == 1
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_blind_ones_begin_with_what_others_found(monkeypatch: pytest.MonkeyPatch) -> None:
     """The same margin is the same schedule, another margin a short ascent, another network a new search."""
     ascents: list[int] = []
