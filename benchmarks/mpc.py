@@ -2,7 +2,7 @@
 
 python -m benchmarks.mpc                       # steel of Japan, the world's cycles, generated cycles (20 minutes)
 python -m benchmarks.mpc --only steel_japan    # prints the rows of some; yearly_SEED is a generated cycle
-python -m benchmarks.mpc --only steel_world    # a window of six years, with the extra ``large`` (8 minutes)
+python -m benchmarks.mpc --only steel_world    # a window of six years, with the extra ``large`` (a quarter of an hour)
 """
 
 from __future__ import annotations
