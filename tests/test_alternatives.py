@@ -328,7 +328,7 @@ def test_files_of_scenarios(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
         assert Path(f"one/{stem}.csv").read_bytes() == Path(f"all/{stem}.csv").read_bytes()
         assert Path(f"one/{stem}.png").is_file()
         assert alone_said[0] == "start: the first episode of evaluation 1"
-        assert [f"{scenario}: {line}" for line in alone_said[:2]] == [
+        assert [f"{scenario}: {line}" for line in alone_said[:3]] == [
             line for line in printed.splitlines() if line.startswith(f"{scenario}: ")
         ]
     expected = [figures("bottles.toml", scenario, "neutral", 1) for scenario in scenarios]
@@ -407,8 +407,9 @@ def test_what_is_said_of_each(
     assert cirl(monkeypatch, "bottles.toml", *repeated("scenario", "default", "crisis")) == 0
     printed = capsys.readouterr().out.splitlines()
     for scenario in ("default", "crisis"):
-        _, levels, cut = (each for each in printed if each.startswith(f"{scenario}: ") and "λ̄" not in each)
+        _, levels, shares, cut = (each for each in printed if each.startswith(f"{scenario}: ") and "λ̄" not in each)
         assert levels.startswith(f"{scenario}: service levels: bottles_in_use ")
+        assert shares.startswith(f"{scenario}: end-of-life recycling rate ")
         assert cut.startswith(f"{scenario}: arc 'imports' moved ")
 
 
