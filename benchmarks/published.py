@@ -5,13 +5,15 @@ python -m benchmarks.published
 
 from __future__ import annotations
 
+import fnmatch
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
 from benchmarks.document import write_sections
 from benchmarks.steel import DOCUMENT
-from cirl_marl import simulate
+from cirl_marl import CirlError, simulate
+from cirl_marl.errors import unknown_name
 from cirl_marl.evaluation.simulations import Simulation
 
 
@@ -21,7 +23,7 @@ class Figure:
 
     network: str
     name: str
-    arcs: Annotated[tuple[str, ...], "whose sum it is; a name that begins with * stands for all that end in the rest"]
+    arcs: Annotated[tuple[str, ...], "whose sum it is, less those after a -; * stands for anything"]
     values: Annotated[Mapping[int, float], "Mt/a by year"]
     source: str
     difference: Annotated[str, "why the model has another"]
@@ -72,19 +74,19 @@ FIGURES = (
 
 
 def modelled(figure: Figure, simulation: Simulation, year: int) -> float:
-    """Return the model's value of a year, Mt/a."""
+    """Return the model's value of a year, Mt/a.
+
+    Raises:
+        CirlError: if a name stands for no arc.
+    """
     network, total = simulation.network, 0.0
-    calendar_start = network.episode.start
-    assert calendar_start is not None
-    step = year - int(float(str(calendar_start)))
+    first = int(str(network.episode.start)[:4])
+    flow = dict(zip((arc.id for arc in network.arcs), simulation.rollout.flow[year - first].tolist(), strict=True))
     for name in figure.arcs:
-        sign, wanted = (-1.0, name[1:]) if name.startswith("-") else (1.0, name)
-        chosen = [
-            k
-            for k, arc in enumerate(network.arcs)
-            if arc.id == wanted or (wanted[0] == "*" and arc.id.endswith(wanted[1:]))
-        ]
-        total += sign * float(simulation.rollout.flow[step, chosen].sum())
+        chosen = fnmatch.filter(flow, name.removeprefix("-"))
+        if not chosen:
+            raise CirlError(f"{figure.network}: {unknown_name('arc', name, flow)}")
+        total += (-1.0 if name.startswith("-") else 1.0) * sum(flow[arc] for arc in chosen)
     return total
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from cirl_marl import MultiAgentVectorEnv
+from benchmarks.published import FIGURES, modelled
+from cirl_marl import CirlError, MultiAgentVectorEnv, simulate
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.definitions.catalogue import load_network
@@ -75,3 +78,27 @@ def test_circularity_is_better_where_more_is_collected_or_less_is_wanted(name: s
     plain, high, less = (float(run.episode_circularity[0]) for run in found.values())
     assert plain < high < 0
     assert plain < less < 0
+
+
+@pytest.mark.parametrize("name", CYCLES)
+def test_what_is_held_against_published_years(name: str) -> None:
+    """Sums and differences of the flows of a year, by hand; they are of the order that is published."""
+    simulation = simulate(name, steps=8)
+    network, run = simulation.network, simulation.rollout
+    arcs = {
+        "mined": ["mining"],
+        "primary": ["mining"],
+        "old scrap": [arc.id for arc in network.arcs if arc.id.endswith("_collected")],
+        "into use": ["into_use"],
+        "made, without fibres": ["virgin", "recycled"],
+    }
+    begins = {"copper_world": 2015, "aluminium_world": 2019, "plastics_world": 2020}[name]
+    for figure in (each for each in FIGURES if each.network == name):
+        for year, published in figure.values.items():
+            expected = flow(network, run, *arcs[figure.name], year=year - begins)
+            if "fibres" in figure.name:
+                expected -= flow(network, run, "to_textiles", year=year - begins)
+            found = modelled(figure, simulation, year)
+            assert found == pytest.approx(expected) and abs(found / published - 1) < 0.2
+        with pytest.raises(CirlError, match=r"unknown arc 'minig'"):
+            modelled(replace(figure, arcs=("minig",)), simulation, begins)
