@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from typing import Any
 
+import highspy
 import numpy as np
 import pytest
 from scipy import sparse
@@ -186,6 +187,41 @@ def test_middling_programs_of_windows_are_solved_by_interior_points_alone(monkey
     usual, alone = reached
     assert alone.least_service.min() > 0.9 - 2e-3
     assert alone.episode_circularity == pytest.approx(usual.episode_circularity, rel=0.005)
+
+
+def test_a_middling_program_leaves_its_basis_and_takes_a_plan_whose_multipliers_went_wrong(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of what need not be certified; a smaller program goes on from its basis, and is tried again."""
+    tried, run = list[tuple[Any, Any]](), solver._ScaledProgram.run
+    problem = bound("copper_net", min_service=0.9, degree=1, horizon=8).problem
+    basis = solver.solve(problem).basis
+    assert basis is not None
+
+    class Undecided:
+        """HiGHS, which says that it does not know."""
+
+        def __init__(self, highs: Any) -> None:
+            self._highs = highs
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self._highs, name)
+
+        def getModelStatus(self) -> highspy.HighsModelStatus:
+            return highspy.HighsModelStatus.kUnknown
+
+    def noted(scaled: Any, options: solver.HighsOptions | None, start: Any, **others: Any) -> Any:
+        tried.append((options, start))
+        return Undecided(run(scaled, options, start, **others))
+
+    monkeypatch.setattr(solver._ScaledProgram, "run", noted)
+    monkeypatch.setattr(solver._ScaledProgram, "distance", lambda *_: 1.0)
+    solver.solve(problem, basis, certify=False)
+    assert tried[0] == (None, basis) and [options for options, _ in tried[1:]] == [*solver.SETTINGS]
+    monkeypatch.setattr(solver, "BASIS_PROGRAM", 0)
+    tried.clear()
+    solver.solve(problem, basis, certify=False)
+    assert tried == [(solver.SETTINGS[1], None)]
 
 
 def test_without_hipo_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pages import HOSTILE, bottles_at, shown, world
 
-from cirl_marl import CirlError, Network, load_network
+from cirl_marl import CirlError, Network, indicators, load_network
 from cirl_marl.definitions.catalogue import families
 from cirl_marl.definitions.sources import stated_numbers
 from cirl_marl.drawing.flow_diagram import flow_diagrams, groups
@@ -267,3 +267,18 @@ def test_points_alone_are_a_page(tmp_path: Path) -> None:
     told = page_data(ReportPage("sweep", network, points=points, front=np.array([[0.9, -1.0], [1.0, -1.5]])))
     assert told["scenes"] == told["networks"] == [] and told["front"] == [[0.9, -1], [1, -1.5]]
     assert [each["service"] for each in told["points"]] == [0.9, None]
+
+
+def test_indicators_stand_among_the_figures() -> None:
+    """Of every scene, as shares without an interval; a network in which nothing is in use has none."""
+    for name in ("copper_net", "carbo_net"):
+        simulations = simulate_alternatives(name, steps=20)
+        (simulation,) = simulations
+        found = indicators(simulation.network, simulation.rollout.mean_flow)
+        told = page_data(page_of_alternatives(simulations))["scenes"][0]["figures"]
+        if found is None:
+            assert name == "carbo_net" and not {"recycling_rate", "recycled_content"} & told.keys()
+            continue
+        expected = {"recycling_rate": found.recycling_rate, "recycled_content": found.recycled_content}
+        for which, share in expected.items():
+            assert told[which] == [pytest.approx(share, rel=1e-4), None, None]
