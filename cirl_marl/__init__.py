@@ -75,6 +75,7 @@ if TYPE_CHECKING:
     from cirl_marl.learners.teams.team import Team as Team
     from cirl_marl.learners.teams.team import independent as independent
     from cirl_marl.learners.trainer import Training as Training
+    from cirl_marl.network.elements import Account as Account
     from cirl_marl.network.elements import Arc as Arc
     from cirl_marl.network.elements import Control as Control
     from cirl_marl.network.elements import ControlKind as ControlKind
@@ -147,7 +148,7 @@ _MODULES = {
     "learners.recipe": "Recipe load_recipe",
     "learners.teams.team": "Team independent",
     "learners.trainer": "Training",
-    "network.elements": "Arc Control ControlKind Episode Law Node Objective Observation Role Service",
+    "network.elements": "Account Arc Control ControlKind Episode Law Node Objective Observation Role Service",
     "network.network": "Network",
     "network.series": "Series",
     "optimum.admissible": "NoCertificate",

@@ -93,11 +93,31 @@ MinService = Annotated[
     float | None,
     typer.Option(min=0.0, max=1.0, help="Mean level of each service that plans are for; default: all there is."),
 ]
+AtMost = Annotated[
+    list[str] | None,
+    typer.Option("--at-most", help="ACCOUNT=TOTAL, a budget of an account that plans keep; repeatable."),
+]
 
 Html = Annotated[
     Path | None,
     typer.Option("--html", help="Report for the browser to write as well: one .html file, which needs no server."),
 ]
+
+
+def budgets(entries: Sequence[str] | None) -> dict[str, float]:
+    """Read budgets, ACCOUNT=TOTAL each.
+
+    Raises:
+        CirlError: naming what is no budget.
+    """
+    totals = {}
+    for entry in entries or ():
+        account, _, total = entry.partition("=")
+        try:
+            totals[account] = float(total)
+        except ValueError:
+            raise CirlError(f"--at-most {entry}: needs ACCOUNT=TOTAL with a number") from None
+    return totals
 
 
 def plain(error: BaseException) -> str:

@@ -169,6 +169,10 @@ def plan(
         bool | None,
         typer.Option(help="Of optimum's plans of equal worth the one with least change; default: unless it is large."),
     ] = None,
+    aim: Annotated[
+        str, typer.Option(help="Of optimum: circularity, or the account to keep low beside --min-service.")
+    ] = "circularity",
+    at_most: common.AtMost = None,
     html: common.Html = None,
 ) -> None:
     """Write what a policy or controller does in one episode, beside business as usual, and what that saves.
@@ -186,6 +190,7 @@ def plan(
         raise CirlError(f"--out {out}: needs the name of a .csv file")
     page = common.page_for(html)
     options: dict[str, Any] = {"scenario": scenario, "min_service": min_service, "seed": seed, "smooth": smooth}
+    options |= {"aim": aim, "at_most": common.budgets(at_most)}
     with common.bar("planning") as progress:
         schedule = plans.plan(source, control, **options, progress=progress)
     network = schedule.network

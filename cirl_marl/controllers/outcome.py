@@ -23,7 +23,7 @@ NOTABLE = 1e-3
 
 
 def outcome_lines(network: Network, run: Rollout, origin: EpisodeStart) -> list[str]:
-    """Return where the first episode of a rollout began, λ̄, services, indicators, and which flows and services lacked.
+    """Return where the first episode of a rollout began, λ̄, services, accounts, indicators, and what lacked.
 
     A network that states the criticality of its material has its time-window circularity as well.
     """
@@ -35,8 +35,16 @@ def outcome_lines(network: Network, run: Rollout, origin: EpisodeStart) -> list[
     if len(network.services) > 1:
         levels = zip(network.services, run.episode_levels[0].tolist(), strict=True)
         lines.append(f"service levels: {', '.join(f'{service.id} {level:.4f}' for service, level in levels)}")
+    if network.accounts:
+        lines.append(f"accounts: {totals_text(network, run)}")
     found = indicators(network, run.flow.mean(axis=0))
     return [*lines, *([found.text(network)] if found else []), *shortage_lines(network, run)]
+
+
+def totals_text(network: Network, run: Rollout) -> str:
+    """Say what the first episode of a rollout comes to on each account, discounted where the account is."""
+    totals = zip(network.accounts, run.accounts[0].tolist(), strict=True)
+    return ", ".join(f"{account.id} {total:.5g} {account.unit}" for account, total in totals)
 
 
 def shortage_lines(network: Network, run: Rollout) -> list[str]:

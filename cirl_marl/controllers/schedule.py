@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from cirl_marl.controllers.basic import Controller, Neutral
-from cirl_marl.controllers.outcome import outcome_lines
+from cirl_marl.controllers.outcome import outcome_lines, totals_text
 from cirl_marl.controllers.rollout import EpisodeStart, Rollout, episode_start, interval_ends, rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
@@ -43,6 +43,8 @@ class Schedule:
         """Say where the episode begins, what comes of it, and what business as usual would have come to."""
         usual = f"λ̄ = {float(self.usual.episode_circularity[0]):.5g} {self.network.mass_unit}"
         usual += f", service level {float(self.usual.episode_service[0]):.4f}"
+        if self.network.accounts:
+            usual += f", {totals_text(self.network, self.usual)}"
         lines = [*outcome_lines(self.network, self.rollout, self.episode_start), f"as usual: {usual}"]
         return "\n".join([*lines, *filter(None, (self.proof, self.note))])
 
@@ -93,6 +95,7 @@ def schedule(
         (f"circularity at the end ({network.mass_unit})", run.circularity[0]),
         (f"mean circularity ({network.mass_unit})", run.circularity_mean[0]),
         ("service level (1)", run.service[0]),
+        *((f"{a.id} ({a.unit})", amount) for a, amount in zip(network.accounts, run.booked[0], strict=True)),
         *(
             (f"stock of {node.id} at the end ({network.mass_unit})", run.stock[:, i])
             for i, node in enumerate(network.stores)

@@ -18,7 +18,7 @@ from cirl_marl.definitions.schema import Batches, ModelTable, NetworkTable
 from cirl_marl.definitions.series_tables import Clock, column_value, inline_series, product
 from cirl_marl.errors import CirlError, NetworkError, unknown_name
 from cirl_marl.network import Network, elements
-from cirl_marl.network.declarations import Declaration, Numbers, Quantity, Subtable, declarations
+from cirl_marl.network.declarations import Declaration, Numbers, Quantity, Rates, Subtable, declarations
 from cirl_marl.network.disturbances import KINDS, Correlation, DisturbanceEffect
 from cirl_marl.network.elements import LAW_FIELDS, Arc, Control, ControlKind, Law, Node
 from cirl_marl.network.series import Series, Value, extremes
@@ -82,6 +82,9 @@ class Converter:
             "nodes": tuple(self._compartment(Node, id_, node, f"nodes.{id_}") for id_, node in table.nodes.items()),
             "arcs": tuple(self._compartment(Arc, id_, arc, f"arcs.{id_}") for id_, arc in table.arcs.items()),
             "services": tuple(self._part(elements.Service, part, f"services.{id_}", id=id_) for id_, part in services),
+            "accounts": tuple(
+                self._part(elements.Account, part, f"accounts.{id_}", id=id_) for id_, part in table.accounts.items()
+            ),
             "episode": self._part(elements.Episode, table.episode, "episode"),
             "objective": self._part(elements.Objective, table.objective, "objective"),
             "observation": self._part(elements.Observation, table.observation, "observation"),
@@ -140,6 +143,8 @@ class Converter:
             if value != int(value):
                 self.mistakes.append(f"{path}: {value} must be a whole number of control intervals")
             return int(value)
+        if isinstance(declaration, Rates):
+            return {account: self._rate(declaration, account, rate, path) for account, rate in entry.items()}
         if isinstance(declaration, Subtable) and declaration.of in SUBRECORDS:
             return self._part(SUBRECORDS[declaration.of], entry, path)
         if isinstance(entry, Range):
@@ -156,6 +161,16 @@ class Converter:
         if isinstance(declaration, Numbers) and declaration.table_form == "matrix":
             return tuple(map(tuple, entry))
         return tuple(entry) if isinstance(entry, list) else entry
+
+    def _rate(self, declaration: Rates, account: str, rate: Any, path: str) -> Value:
+        """Return what is charged on an account."""
+        if account not in self.table.accounts:
+            self.mistakes.append(f"{path}: {unknown_name('account', account, self.table.accounts)}")
+            return 0.0
+        units = self.table.units
+        per = f"({units.mass})" if declaration.per == "mass" else f"(({units.mass})*({units.time}))"
+        table: Any = self.table.accounts[account]
+        return self._value(rate, f"({table.unit})/{per}", f"{path}.{account}")
 
     def _record(self, entry: RecordColumn, path: str) -> tuple[float, ...]:
         texts = {key: self._with_region(text, f"{path}.where.{key}") for key, text in entry.where.items()}

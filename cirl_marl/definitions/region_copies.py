@@ -125,7 +125,9 @@ def _strangers(pattern: Document, change: Document, prefix: str) -> Iterator[str
 
 
 def _add_common(document: dict[str, Any], pattern: dict[str, Any], regions: Sequence[str]) -> None:
-    """Move disturbances that regions share from what is copied to ``document``, and write out what correlates them."""
+    """Move accounts and disturbances that regions share to ``document``, and write out what correlates them."""
+    if "accounts" in pattern:
+        document["accounts"] = {**pattern["accounts"], **document.get("accounts", {})}
     own = pattern.get("disturbances", {})
     common = {name: part for name, part in own.items() if isinstance(part, Mapping) and part.get("common") is True}
     if own:

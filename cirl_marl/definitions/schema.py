@@ -17,6 +17,7 @@ from cirl_marl.network.declarations import (
     Declaration,
     Numbers,
     Quantity,
+    Rates,
     Subtable,
     Word,
     declarations,
@@ -26,6 +27,7 @@ from cirl_marl.network.declarations import (
 from cirl_marl.network.disturbances import KINDS, Correlation
 from cirl_marl.network.elements import (
     IDENTIFIER,
+    Account,
     Arc,
     Control,
     Episode,
@@ -97,6 +99,8 @@ def _key(record: type[Any], name: str, kind: Any) -> tuple[Any, Any]:
     options: dict[str, Any] = {"description": declaration.meaning, "alias": declaration.key or None}
     if is_required(record, name):
         return kind, Field(**options)
+    if isinstance(declaration, Rates):
+        return kind, Field({}, **options)
     if isinstance(declaration, Quantity | Numbers | Subtable | CalendarTime):
         return kind | None, Field(None, **options)
     return kind, Field(list(default) if isinstance(default, tuple) else default, **options)
@@ -122,6 +126,8 @@ def _field_type(declaration: Declaration, hint: Any) -> Any:
         ]
     if isinstance(declaration, CalendarTime):
         return quantities.Time
+    if isinstance(declaration, Rates):
+        return dict[Identifier, VaryingQuantity]  # type: ignore[valid-type]
     if isinstance(declaration, Quantity) and declaration.unit_of_table:
         return quantities.Number
     if isinstance(declaration, Quantity) and declaration.past:
@@ -142,6 +148,7 @@ def _disturbance_table(kind: str) -> Any:
     return table_of(KINDS[kind], kind=(Literal[kind], word), unit=(str, unit), source=(quantities.Source, ...))
 
 
+VaryingQuantity = quantities.number_forms(quantities.QuantityTable, quantities.SeriesTable, quantities.ColumnTable)
 FixedQuantity = quantities.number_forms(quantities.QuantityTable, None, quantities.ColumnTable)
 _OF_CONTROL = {
     "disturbed_by": "name of a disturbance of its capacity, the value at action +1",
@@ -159,6 +166,7 @@ RuleTable = table_of(FeedbackRule)
 NodeTable = table_of(Node)
 ArcTable = table_of(Arc)
 ServiceTable = table_of(Service)
+AccountTable = table_of(Account)
 EpisodeTable = table_of(Episode)
 ObjectiveTable = table_of(Objective)
 ObservationTable = table_of(Observation)
@@ -238,6 +246,9 @@ class NetworkTable(quantities.Table):
     nodes: dict[Identifier, NodeTable]  # type: ignore[valid-type]
     arcs: dict[Identifier, ArcTable]  # type: ignore[valid-type]
     services: dict[Identifier, ServiceTable] = Field({})  # type: ignore[valid-type]
+    accounts: dict[Identifier, AccountTable] = Field(  # type: ignore[valid-type]
+        {}, description="what is counted beside mass: money, emissions, energy"
+    )
     disturbances: dict[Identifier, DisturbanceTable] = Field(
         {}, description="processes in time that disturb the quantities that name them in ``disturbed_by``"
     )

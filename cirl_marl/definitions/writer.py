@@ -38,9 +38,11 @@ def fingerprint(network: Network) -> str:
     """Return a hash of the network under its scenario: of its definition, but for what changes no result."""
     document = _Writer(network).document() | {"title": network.name, "material": Network.material}
     document.pop("references", None)
+    document.pop("accounts", None)  # what is booked changes nothing that moves
     for kind in ("nodes", "arcs", "services"):
         for part in document[kind].values():
-            part.pop("title", None)
+            for key in ("title", "accounts", "holding"):
+                part.pop(key, None)
     return hashlib.sha256(json.dumps(document, default=str).encode()).hexdigest()
 
 
@@ -48,7 +50,7 @@ def _toml_tables(document: dict[str, Any]) -> tomlkit.TOMLDocument:
     """Lay settings and compartments out as tables with a line for each key."""
     layout = tomlkit.document()
     for key, value in document.items():
-        if key in ("nodes", "arcs", "services", "disturbances") and value:
+        if key in ("nodes", "arcs", "services", "accounts", "disturbances") and value:
             layout[key] = tomlkit.table(is_super_table=True)
             for id_, part in value.items():
                 layout[key][id_] = _fill_table(tomlkit.table(), part)
@@ -89,6 +91,7 @@ class _Writer:
                 key: {part.id: self._part(part, f"{key}.{part.id}") for part in getattr(network, key)}
                 for key in ("nodes", "arcs", "services")
             },
+            **({"accounts": {part.id: self._part(part) for part in network.accounts}} if network.accounts else {}),
             **self._disturbances(),
         }
 
@@ -124,10 +127,13 @@ class _Writer:
             elif isinstance(declaration, declarations.Quantity) and declaration.unit_of_table:
                 unit_ = self._units.get(declaration.kind(part)) or part.unit
                 table |= {key: float(value), "unit": unit_, "source": SOURCE}
+            elif isinstance(declaration, declarations.Rates):
+                table[key] = {
+                    account: self._number(rate, f"{path}.{name}.{account}", self._rate_unit(declaration, account))
+                    for account, rate in value
+                }
             elif isinstance(declaration, declarations.Quantity):
-                spread = self._network.uncertain.get(f"{path}.{name}")
-                table[key] = self._quantity(value, declaration.kind(part)) | _spread_keys(spread, value)
-                table[key] |= self._disturbance_keys(f"{path}.{name}")
+                table[key] = self._number(value, f"{path}.{name}", self._units.get(declaration.kind(part), "1"))
             elif isinstance(declaration, declarations.Numbers):
                 unit = {"unit": self._units.get(declaration.of, "1"), "source": SOURCE}
                 if declaration.table_form == "range":
@@ -151,6 +157,16 @@ class _Writer:
                 table[key] = value if isinstance(value, bool | int) else str(value)
         table.pop("reward_scale", None)  # it stands in the table of the model
         return table
+
+    def _number(self, value: Value, path: str, unit: str) -> dict[str, Any]:
+        number = self._quantity(value, "1") | {"unit": unit} | _spread_keys(self._network.uncertain.get(path), value)
+        return number | self._disturbance_keys(path)
+
+    def _rate_unit(self, declaration: declarations.Rates, account: str) -> str:
+        units = {account.id: account.unit for account in self._network.accounts}
+        per = f"({self._units['mass']})"
+        per = per if declaration.per == "mass" else f"({per}*({self._units['time']}))"
+        return f"({units[account]})/{per}"
 
     def _control(self, part: Compartment) -> dict[str, Any]:
         control = part.control

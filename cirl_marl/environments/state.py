@@ -29,6 +29,7 @@ class State:
     batched: Annotated[Floats, "m_fb of this episode, in two parts as in ``Network.circularity``, shape (2, B), mass"]
     circularity: Annotated[Floats, "sum over the episode of the interval means of λ, shape (B,), mass"]
     service: Annotated[Floats, "sum over the episode of the level of each service, shape (services, B)"]
+    accounts: Annotated[Floats, "amounts booked in this episode, discounted, shape (accounts, B)"]
     processes: Annotated[
         Floats, "states of the disturbances in all intervals of the episode and the one after, (intervals, names, B)"
     ] = field(default_factory=no_paths)
@@ -87,6 +88,8 @@ class Outcome:
     levels: Annotated[Floats, "level of each service, shape (services, B)"]
     service_level: Annotated[Floats, "their mean, shape (B,); 1 without services"]
     flow: Annotated[Floats, "mean flows, shape (arcs, B), mass/time"]
+    entries: Annotated[Floats, "amount of each entry of the ledger, not discounted, shape (entries, B)"]
+    booked: Annotated[Floats, "amounts booked on accounts, not discounted, shape (accounts, B)"]
     truncated: Annotated[NDArray[np.bool_], "time limit reached, shape (B,)"]
     success: Annotated[Mapping[str, NDArray[np.bool_]], "whether the task of a compartment's model is done, shape (B,)"]
 

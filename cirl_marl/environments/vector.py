@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.definitions.ids import environment_name
 from cirl_marl.dynamics.integrator import Dynamics, Transition
+from cirl_marl.dynamics.ledger import Ledger
 from cirl_marl.dynamics.supply import Supply
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.observations import ObservationLayout
@@ -69,6 +70,7 @@ class MultiAgentVectorEnv:
         rows: which row of the physical state is what.
         actuators: from actions to controls.
         idle: which arcs of ``supply`` nobody acts on.
+        ledger: what is booked on accounts.
         supply: the arcs that make up for services.
         controls: their values in the last interval, in the rows of ``network.control_rows``, (controls, num_envs).
         state_names: nodes, ``compartment.state`` of the inner states, ``arc.row`` of the masses of batch arcs, and
@@ -136,6 +138,7 @@ class MultiAgentVectorEnv:
         self.agents = self.actuators.agents
         self.action_spaces = self.actuators.spaces
         self.layout = ObservationLayout(self.dynamics, self.agents, observe, num_envs)
+        self.ledger = Ledger(variant, self.dynamics.factors.ranges)
         self.scoring = Scoring(self.dynamics, self.layout, self.agents, num_envs)
         self.idle = self.supply.idle(self.agents)
         self._credit = Credit(self.dynamics, self.supply, self.scoring, self.agents, self.reward_mode, moment)
@@ -292,6 +295,7 @@ class MultiAgentVectorEnv:
         ``service_levels``     level of each service, a dict service → shape (B,)
         ``cost_SERVICE``       shortfall 1 − level of each service, shape (B,)
         ``cost``               sum of the shortfalls, shape (B,): what safe reinforcement learning keeps below a budget
+        ``accounts``           amount booked on each account in the interval, a dict account → shape (B,), if any
         ``drawn``              with ``uncertain``: factors in the order of ``network.uncertain``, shape (B, numbers)
         ``disturbances``       their values in the interval, a dict disturbance → shape (B,), if there are any
         ``year``               calendar year at the end, shape (B,), if the network begins in one
@@ -313,6 +317,9 @@ class MultiAgentVectorEnv:
             "cost": cost,
             **dict(zip(self._costs, costs, strict=True)),
         }
+        if self.ledger.accounts:
+            outcome.booked.setflags(write=False)
+            info["accounts"] = dict(zip(self.ledger.accounts, outcome.booked, strict=True))
         info |= self.drawn_info(np.maximum(self.physical.step - 1, 0))
         if (year := self.year) is not None:
             year.flags.writeable = False
@@ -393,7 +400,14 @@ class MultiAgentVectorEnv:
         circularity, mean, batch_mass = self._credit.circularity(state, transition, flow)
         reward = self._credit.pay(circularity, mean, local, terms, levels, state, controls)
         step = state.step + 1
-        measures, totals = quantities[self.layout.signals.measures], (state.circularity + mean, state.service + levels)
+        entries = booked = accounts = state.accounts
+        if self.ledger.accounts:
+            before, after = self.rows.stocks(state.stock), self.rows.stocks(transition.stock)
+            entries = self.ledger.entries(flow, before, after, state.step, factors)
+            booked = self.ledger.sums(entries)
+            accounts = accounts + booked * self.ledger.discount.take(state.step, axis=1)
+        totals = (state.circularity + mean, state.service + levels, accounts)
+        measures = quantities[self.layout.signals.measures]
         drawn = (state.processes, state.disturbances)
         self._state = State(
             transition.stock, transition.inner, flow, measures, step, state.factors, batch_mass, *totals, *drawn
@@ -401,7 +415,8 @@ class MultiAgentVectorEnv:
         self.interval = Interval(state, self._state, actions, controls)
         observation = self.layout.observe(quantities, step / horizon, levels, self._sight(self._state))
         success = dynamics.inner.successes(transition.inner, controls)
-        return Outcome(observation, reward, local, circularity, mean, levels, service, flow, step >= horizon, success)
+        scores = (reward, local, circularity, mean, levels, service)
+        return Outcome(observation, *scores, flow, entries, booked, step >= horizon, success)
 
     def go_back(self, state: State, controls: Floats) -> None:
         """Go back to a state of this episode, as ``physical`` gave it, and the ``controls`` that led to it."""
@@ -461,11 +476,13 @@ class MultiAgentVectorEnv:
             info |= {"_final_obs": over, "_final_info": over}
 
     def episode_figures(self) -> dict[str, Floats]:
-        """Return λ̄ and the mean service level of the episode up to now, shape (B,) each, as infos name them."""
+        """Return λ̄, the mean service level and amounts on accounts up to now, shape (B,) each, as infos name them."""
         state = self.physical
         steps = np.maximum(state.step, 1)
         service = self.scoring.service_level(state.service / steps)
-        return {"episode_circularity": state.circularity / steps, "episode_service_level": service}
+        figures = {"episode_circularity": state.circularity / steps, "episode_service_level": service}
+        totals = zip(self.ledger.accounts, state.accounts, strict=True)
+        return figures | {f"episode_{account}": total for account, total in totals}
 
     def _restart(self, over: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Start the next episode in copies whose last is ``over``, shape (B,), and return the observation of all."""
@@ -503,8 +520,8 @@ class MultiAgentVectorEnv:
         neutral = self.supply(stock, inner, dynamics.neutral_in(step, scales), step, idle, scales)
         flow, measures = dynamics.start_flow(stock, inner, neutral, scales), dynamics.inner.measures(inner, neutral)
         batched, circularity = np.zeros((2, batch)), np.zeros(batch)
-        service = np.zeros((len(self.network.services), batch))
-        sums = (batched, circularity, service)
+        service, accounts = (np.zeros((len(part), batch)) for part in (self.network.services, self.network.accounts))
+        sums = (batched, circularity, service, accounts)
         return State(stock, inner, flow, measures, step, factors, *sums, paths.states, paths.values)
 
     def _measure(self, transition: Transition, controls: Floats) -> tuple[Floats, Floats]:

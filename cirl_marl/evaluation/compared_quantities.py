@@ -16,21 +16,24 @@ from cirl_marl.optimum.bounds import relative
 ROUND_OFF = 1e-12
 """Share of the largest value of its kind by which a quantity may differ and yet count as the same."""
 
-QuantityKind = Literal["circularity", "service", "flow", "stock"]
+QuantityKind = Literal["circularity", "service", "account", "flow", "stock"]
 NAMES: Mapping[QuantityKind, str] = {
     "circularity": "mean circularity",
     "service": "mean level of service {}",
+    "account": "total of {}",
     "flow": "total flow of {}",
     "stock": "final stock of {}",
 }
-"""What quantities are called, {} standing for the id of the service, arc or node."""
+"""What quantities are called, {} standing for the id of the service, account, arc or node."""
 
 
 @positional_record
 class ComparedQuantity:
     """A figure of a whole episode in each of A alternatives."""
 
-    kind: Annotated[QuantityKind, "λ̄, mean level of a service, mass that an arc moved, or stock of a node at the end"]
+    kind: Annotated[
+        QuantityKind, "λ̄, mean level of a service, amount on an account, mass that an arc moved, or stock at the end"
+    ]
     of: Annotated[str, "id of the service, arc or node; empty for λ̄"]
     unit: Annotated[str, "that of the values"]
     values: Annotated[Floats, "shape (A,); NaN where a scenario has no such service, arc or node"]
@@ -65,10 +68,11 @@ class ComparedQuantity:
 def rank_quantities(simulations: Sequence[Simulation]) -> list[ComparedQuantity]:
     """Return the figures of episodes of ``simulate_alternatives``, those first that differ most.
 
-    They are λ̄, the mean level of each service, the mass that each arc moved in the episode, and the stock of each node
-    at the end.
+    They are λ̄, the mean level of each service, the amount on each account, the mass that each arc moved in the episode,
+    and the stock of each node at the end.
 
-    The order is that of ``ComparedQuantity.rank``. Round-off is ``ROUND_OFF`` of the largest value of the same kind.
+    The order is that of ``ComparedQuantity.rank``. Round-off is ``ROUND_OFF`` of the largest value of the same kind, or
+    account.
     """
     figures = [_figures(figures_of_one) for figures_of_one in simulations]
     quantities: list[ComparedQuantity] = []
@@ -76,8 +80,11 @@ def rank_quantities(simulations: Sequence[Simulation]) -> list[ComparedQuantity]
         ids = list(dict.fromkeys(id_ for figures_of_one in figures for id_ in figures_of_one[kind]))
         values = np.array([[figures_of_one[kind].get(id_, math.nan) for figures_of_one in figures] for id_ in ids])
         unit = "1" if kind == "service" else simulations[0].network.mass_unit
-        round_off = ROUND_OFF * float(np.abs(np.nan_to_num(values)).max(initial=0.0))
-        quantities += (ComparedQuantity(kind, id_, unit, row, round_off) for id_, row in zip(ids, values, strict=True))
+        units = {a.id: a.unit for s in simulations for a in s.network.accounts} if kind == "account" else {}
+        for id_, row in zip(ids, values, strict=True):
+            alike = row if kind == "account" else values
+            round_off = ROUND_OFF * float(np.abs(np.nan_to_num(alike)).max(initial=0.0))
+            quantities.append(ComparedQuantity(kind, id_, units.get(id_, unit), row, round_off))
     return sorted(quantities, key=lambda quantity: -quantity.rank)
 
 
@@ -89,6 +96,7 @@ def _figures(alternative: Simulation) -> dict[QuantityKind, dict[str, float]]:
     return {
         "circularity": {"": float(run.episode_circularity[0])},
         "service": dict(zip((service.id for service in network.services), levels.tolist(), strict=True)),
+        "account": dict(zip((account.id for account in network.accounts), run.accounts[0].tolist(), strict=True)),
         "flow": dict(zip((arc.id for arc in network.arcs), masses.tolist(), strict=True)),
         "stock": dict(zip((node.id for node in network.stores), stocks.tolist(), strict=True)),
     }

@@ -59,6 +59,9 @@ def summary(env: MultiAgentVectorEnv, rollouts: Mapping[str, Rollout]) -> dict[s
             "return": _by_agent(env, run.returns),
             "local_return": _by_agent(env, run.local_returns),
         }
+        if env.network.accounts:
+            totals = zip(env.network.accounts, run.accounts.T, strict=True)
+            figures[name]["accounts"] = {account.id: over_episodes(row).as_dict() for account, row in totals}
         if found := indicators(env.network, run.mean_flow):
             figures[name]["indicators"] = asdict(found)
         if env.network.objective.criticality is not None:

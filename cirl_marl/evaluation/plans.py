@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from numpy.typing import ArrayLike
 
@@ -15,6 +16,8 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Network
+from cirl_marl.network.elements import CIRCULARITY
+from cirl_marl.optimum.aims import budget_texts
 from cirl_marl.optimum.bounds import Bound, gap
 from cirl_marl.optimum.open_loop import Optimum
 from cirl_marl.optimum.options import levels_text
@@ -29,6 +32,8 @@ def plan(
     min_service: ArrayLike | None = None,
     seed: int | None = None,
     smooth: bool | None = None,
+    aim: str = CIRCULARITY,
+    at_most: Mapping[str, float] | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Schedule:
     """Return what a policy or controller does in one episode, beside business as usual.
@@ -48,6 +53,8 @@ def plan(
         smooth: whether a plan of ``optimum`` is the one nearest to business as usual, with the least change from
             interval to interval, among those of the same λ̄ and services (``optimum.smooth``); None: unless the
             network is large. Of other controllers, and where nothing is proved, plans stay as they are.
+        aim: of ``optimum``: ``circularity``, or the account to keep as low as can be beside ``min_service``.
+        at_most: of ``optimum``: budgets, the highest total of accounts by id, in their units.
         progress: called with the share of the work that is done.
 
     Returns:
@@ -60,7 +67,10 @@ def plan(
     """
     if smooth is not None and control != "optimum":
         raise CirlError("--smooth and --no-smooth go with --control optimum")
-    env, controller = _environment_and_controller(source, control, scenario, min_service, smooth)
+    if (aim != CIRCULARITY or at_most) and control != "optimum":
+        raise CirlError("--aim and --at-most go with --control optimum")
+    options = {"min_service": min_service, "smooth": smooth, "aim": aim, "at_most": at_most}
+    env, controller = _environment_and_controller(source, control, scenario, options)
     table = schedule(env, controller, seed=seed, progress=progress)
     name = type(control).__name__ if isinstance(control, Controller) else control or ""
     return replace(table, control=name, note=controller.note, proof=_proof(controller, table))
@@ -77,11 +87,19 @@ def _proof(controller: Controller, table: Schedule) -> str:
     if not isinstance(controller, Optimum) or not isinstance(solution := controller.plans[0], Bound):
         return ""
     network, run, limit, demand = table.network, table.rollout, solution.objective, "any service"
+    aims = solution.aims
     if solution.service_weight is not None:
         limit -= solution.service_weight * float(run.episode_service[0])
         limit, demand = limit * network.objective.circularity_scale, "this service"
     elif solution.min_service is not None:
         demand = f"a service of at least {levels_text(network, solution.min_service)}"
+    unit = "λ̄/scale" if solution.service_weight is not None else f"{network.mass_unit} of λ̄"
+    unit = unit if aims.account is None else network.accounts[aims.account].unit
+    prices = (f"one more is worth {price:.4g} {unit}" for price in solution.budget_prices.values())
+    demand += "".join(f", {text} ({price})" for text, price in zip(budget_texts(network, aims), prices, strict=True))
+    if aims.account is not None:
+        account, share = network.accounts[aims.account], float(gap(limit, aims.value(run)))
+        return f"bound with {demand}: {account.id} ≥ {-limit:.5g} {account.unit}, gap {share:.2%}"
     share = float(gap(limit, float(run.episode_circularity[0])))
     return f"bound with {demand}: λ̄ ≤ {limit:.5g} {network.mass_unit}, gap {share:.2%}"
 
@@ -90,8 +108,7 @@ def _environment_and_controller(
     source: str | Path | Network | RunDirectory,
     control: str | Controller | None,
     scenario: str | None,
-    min_service: ArrayLike | None,
-    smooth: bool | None,
+    options: Mapping[str, Any],
 ) -> tuple[MultiAgentVectorEnv, Controller]:
     run = _run_of(source)
     if control is not None:
@@ -99,12 +116,12 @@ def _environment_and_controller(
             raise CirlError(f"plan {source}: is a training run, which acts by its policies; leave out --control")
         env = MultiAgentVectorEnv(source, num_envs=1, scenario=scenario)
         if isinstance(control, str):
-            control = named_controller(control, min_service=min_service, smooth=smooth)
+            control = named_controller(control, **options)
         return env, control
     if run is None:
         name = source.name if isinstance(source, Network) else source
         raise CirlError(f"plan {name}: which control? --control {'|'.join(CONTROLLERS)}; only a run has policies")
-    if scenario is not None or min_service is not None:
+    if scenario is not None or options["min_service"] is not None:
         raise CirlError("--scenario and --min-service go with --control; a run has its own scenario and policies")
     from cirl_marl.learners.interface import Trained  # it needs torch
 

@@ -47,18 +47,18 @@ class Simulation:
         """Return header and rows: a row for the start and one for the end of each interval.
 
         Columns are year or date at the end, if the network has a start on the calendar, λ at the end and the mean of λ,
-        the service level, stocks at the end, mean flows, what passes through nodes without stock, masses on the way,
-        inner states that an agent may see, mean ages, and what disturbed the interval.
+        the service level, amounts on accounts, stocks at the end, mean flows, what passes through nodes without stock,
+        masses on the way, inner states that an agent may see, mean ages, and what disturbed the interval.
         """
         env, run = self.env, self.rollout
         lambdas = (run.circularity[0], run.circularity_mean[0])
         flows = (*run.flow.T, *env.network.throughput(run.flow.T))
         ages = [pyramid.mean_age for pyramid in pyramids(env.network, run, run.start)]
         insides = (*run.load.T, *run.inner.T, *(age[1:] for age in ages), *run.disturbances[0].T)
-        columns = (*lambdas, run.service[0], *run.stock.T, *flows, *insides)
+        columns = (*lambdas, run.service[0], *run.booked[0], *run.stock.T, *flows, *insides)
         states = [*run.start_load.tolist(), *run.start_inner.tolist(), *(float(age[0]) for age in ages)]
         states += [None] * run.disturbances.shape[2]
-        first = [*[None] * 3, *run.start.tolist(), *[None] * len(flows), *states]
+        first = [*[None] * (3 + len(run.booked[0])), *run.start.tolist(), *[None] * len(flows), *states]
         times = np.concatenate([[0.0], interval_ends(env.network)])
         clock = zip(times.tolist(), *labels(env.network, times)[1], strict=True)
         rows = [first, *zip(*(column.tolist() for column in columns), strict=True)]
@@ -69,6 +69,7 @@ class Simulation:
         mass, time = network.mass_unit, network.time_unit
         header = [f"time ({time})", *(f"{calendar} at the end" for calendar in labels(network, 0.0)[0])]
         header += [f"circularity at the end ({mass})", f"mean circularity ({mass})", "service level"]
+        header += [f"{account.id} ({account.unit})" for account in network.accounts]
         header += [f"stock of {node.id} ({mass})" for node in network.stores]
         header += [f"flow of {arc.id} ({mass}/{time})" for arc in network.arcs]
         header += [f"throughput of {node.id} ({mass}/{time})" for node in network.nodes if not node.stores]

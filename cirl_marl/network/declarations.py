@@ -143,6 +143,8 @@ class Quantity(Declaration):
         return f"must be at least {self.low:g}" if math.isfinite(self.low) else "must be finite"
 
 
+RATE = Quantity("an amount on an account", of="own", varies=True)
+"""What each number of ``Rates`` is."""
 Positive = partial(Quantity, positive=True)
 NotNegative = partial(Quantity, low=0.0)
 Share = partial(Quantity, low=0.0, high=1.0)
@@ -161,6 +163,25 @@ class Numbers(Declaration):
     def problem(self, value: object) -> str:
         """See ``Declaration.problem``."""
         return "" if self.varies and isinstance(value, TimeDependent) else _problem(value, self.form, self.shape)
+
+
+@positional_record
+class Rates(Declaration):
+    """Numbers that may change in time, one for each of some accounts, in the unit of the account per ``per``."""
+
+    per: Annotated[str, "what an amount is charged for: ``mass``, or ``stock``, which is mass · time"] = "mass"
+
+    def problem(self, value: object) -> str:
+        """See ``Declaration.problem``."""
+        pairs = value if isinstance(value, tuple) else ()
+        if not isinstance(value, tuple) or not all(isinstance(pair, tuple) and len(pair) == 2 for pair in pairs):
+            return f"{{account: number, …}}, got {value!r}"
+        faults = [f"{name!r}: a number, got {rate!r}" for name, rate in pairs if not _is_rate(rate)]
+        return next(iter(faults), "")
+
+
+def _is_rate(value: object) -> bool:
+    return isinstance(value, TimeDependent) or (_fits(value, ()) and not isinstance(value, bool))
 
 
 Amount = partial(Numbers, form="a number", shape=(), table_form="amount", varies=True)
@@ -220,6 +241,9 @@ def check_types(owner: str, part_: Any) -> None:
         value = getattr(part_, name)
         if value is default or type(value) is hint is float:
             continue  # by far the most usual
+        if isinstance(declaration, Rates) and isinstance(value, Mapping):
+            value = tuple(value.items())  # which can be hashed
+            object.__setattr__(part_, name, value)
         if isinstance(declaration, Word) and isinstance(declaration.of, type):
             if value not in declaration.of.__members__.values():
                 raise NetworkError(owner, [unknown_name(declaration.label or name, value, declaration.of)])
@@ -258,8 +282,7 @@ class CheckedRecord:
 
 def bound_problems(part_: Any, prefix: str = "") -> Iterator[str]:
     """Yield every number out of its declared bounds, and every word that is none of its words."""
-    for name, declaration in declarations(type(part_)).items():
-        value = getattr(part_, name)
+    for name, declaration, value in numbers(part_):
         if isinstance(declaration, Word) and value not in declaration.of:
             yield f"{prefix}{unknown_name(declaration.label or name, value, declaration.of)}"
         elif isinstance(declaration, Quantity) and value is not None:
@@ -267,6 +290,30 @@ def bound_problems(part_: Any, prefix: str = "") -> Iterator[str]:
                 if fault := declaration.bound_problem(number):
                     yield f"{prefix}{name} {number} {fault}"
                     break
+
+
+def numbers(part_: Any) -> Iterator[tuple[str, Declaration, Any]]:
+    """Give name, declaration and value of every declared field; of rates of accounts each, as ``accounts.NAME``."""
+    for name, declaration in declarations(type(part_)).items():
+        if isinstance(declaration, Rates):
+            yield from ((f"{name}.{account}", RATE, rate) for account, rate in getattr(part_, name))
+        else:
+            yield name, declaration, getattr(part_, name)
+
+
+def with_number(part_: Any, name: str, value: Any, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the ``changes`` of fields of a part, by name, with that of the number ``name`` to ``value``."""
+    field, _, account = name.partition(".")
+    if account:
+        rates = changes.get(field, getattr(part_, field))
+        value = tuple((other, value if other == account else rate) for other, rate in rates)
+    return {**changes, field: value}
+
+
+def number_of(part_: Any, name: str) -> Any:
+    """Return the number ``name`` of a part; see ``numbers``."""
+    field, _, account = name.partition(".")
+    return dict(getattr(part_, field))[account] if account else getattr(part_, field)
 
 
 def _plain_problem(value: object, hint: Any) -> str:

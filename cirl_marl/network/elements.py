@@ -23,6 +23,7 @@ from cirl_marl.network.declarations import (
     Numbers,
     Positive,
     Quantity,
+    Rates,
     Share,
     Subtable,
     Word,
@@ -98,6 +99,7 @@ LEVEL_OF = Kinds("stores", {False: "flow"}, "mass")
 BAND_OF = Kinds("quantity", {"stock": "mass", "measure": "1"}, "flow")
 
 Pair = tuple[float, float]
+AccountRates = tuple[tuple[str, Value], ...]
 
 
 @frozen_record
@@ -185,6 +187,9 @@ class FeedbackRule(CheckedRecord):
     ] = ()
 
 
+RATES = Rates(
+    "amounts by account, per mass that flows along an arc or enters a node; negative ones are revenues or credits"
+)
 LIFETIME = Subtable("how long what enters stays, for arcs of law ``share`` to split what leaves", of="lifetime")
 CONTROL = Subtable("its actuator; None if it cannot act")
 RULE = Subtable(
@@ -211,6 +216,7 @@ class Compartment(CheckedRecord):
     control: Annotated[Control | None, CONTROL] = None
     rule: Annotated[FeedbackRule | None, RULE] = None
     model: Annotated[CompartmentModel | None, MODEL] = None
+    accounts: Annotated[AccountRates, RATES] = ()
     inner: Annotated[tuple[Pair, ...], INNER] = ()
     reward_scale: Annotated[float, Positive("the model's reward is divided by it")] = 1.0
 
@@ -286,6 +292,7 @@ class Node(Compartment):
             of="rate",
         ),
     ] = None
+    holding: Annotated[AccountRates, Rates("amounts by account, per mass that is held and time", per="stock")] = ()
     set_point: Annotated[
         float | None, Quantity("stock aimed at, mass, or throughput, mass/time; None if there is none", of=LEVEL_OF)
     ] = None
@@ -424,6 +431,31 @@ class Service(CheckedRecord):
     def debtors(self) -> tuple[str, ...]:
         """Compartments whose local reward bears the shortfall."""
         return self.owed_by or (self.provider,)
+
+
+CIRCULARITY = "circularity"
+"""What plans aim at that is no account."""
+
+
+@frozen_record
+class Account(CheckedRecord):
+    """What is counted beside mass, such as money, emissions or energy, under an ``id`` of its own.
+
+    Over an episode it comes to Σ_t d_t·h·(Σ_k a_k(t)·f̄_k + Σ_i b_i(t)·(x_i(t) + x_i(t + 1))/2), f̄ being mean flows, a
+    the ``accounts`` of arcs and of the nodes that they enter, b the ``holding`` of nodes, and d_t = (1 + r)^(−τ) the
+    discount of what is booked in the middle of an interval, τ years after the start.
+    """
+
+    id: str
+    title: Annotated[str, TITLE] = ""
+    unit: Annotated[
+        str,
+        Declaration(
+            "unit of its amounts, such as ``t CO2e``, ``GJ``, or ``EUR_2023``: a currency has the year of its prices",
+            mandatory=True,
+        ),
+    ]
+    discount: Annotated[float, Quantity("r, by which a year later counts less", low=-0.99, high=10.0)] = 0.0
 
 
 @frozen_record

@@ -11,8 +11,17 @@ import numpy as np
 from scipy import special
 
 from cirl_marl.errors import unknown_name
-from cirl_marl.network.declarations import CheckedRecord, Positive, Quantity, Word, declarations, frozen_record
-from cirl_marl.network.elements import FIXED_LIFETIME, Arc, Control, ControlKind, Law, Node, Service
+from cirl_marl.network.declarations import (
+    CheckedRecord,
+    Positive,
+    Quantity,
+    Word,
+    frozen_record,
+    number_of,
+    numbers,
+    with_number,
+)
+from cirl_marl.network.elements import FIXED_LIFETIME, Arc, Compartment, Control, ControlKind, Law, Node, Service
 from cirl_marl.network.rowsum import Floats, Integers, single_column
 from cirl_marl.network.series import Series, Value, extremes, in_intervals
 from cirl_marl.network.specification import Specification
@@ -252,7 +261,8 @@ def draw_network(network: Any, factors: Sequence[float] = (), path: Floats | Non
         if name == CAPACITY:  # who stays neutral takes at most what there is
             neutral = np.minimum(network.interval_means(part.control.neutral), network.interval_means(value))
             name, value = "control", replace(part.control, high=value, neutral=in_intervals(neutral, interval))
-        changes.setdefault(id(part), (part, {}))[1][name] = value
+        before = changes.get(id(part), (part, {}))[1]
+        changes[id(part)] = part, with_number(part, name, value, before)
 
     drawn = dict(zip(network.uncertain, factors, strict=True)) if len(factors) else {}
     for number, factor in drawn.items():
@@ -263,7 +273,7 @@ def draw_network(network: Any, factors: Sequence[float] = (), path: Floats | Non
             drawn_sides = {side: _times(network, value, float(factor), most) for side, value in sides.items()}
             change(part, name, replace(part.control, **drawn_sides))
         else:
-            change(part, name, _times(network, getattr(part, name), float(factor)))
+            change(part, name, _times(network, number_of(part, name), float(factor)))
     for number, disturbed in network.disturbed.items():
         assert path is not None
         (part, name), stated = _uncertain_field(network, number), stated_means(network, number)
@@ -308,11 +318,12 @@ def network_of_intervals(network: Any, intervals: Integers) -> Any:
     length = network.episode.control_interval
 
     def part_of_intervals(part: Any) -> Any:
-        series = {
-            name: in_intervals(network.interval_means(value)[intervals], length) or Series(times=(0.0,), values=(0.0,))
-            for name, declaration in declarations(type(part)).items()
-            if isinstance(value := getattr(part, name), Series) and not getattr(declaration, "past", False)
-        }
+        series: dict[str, Any] = {}
+        for name, declaration, value in numbers(part):
+            if isinstance(value, Series) and not getattr(declaration, "past", False):
+                means = network.interval_means(value)[intervals]
+                chosen = in_intervals(means, length) or Series(times=(0.0,), values=(0.0,))
+                series = with_number(part, name, chosen, series)
         if getattr(part, "control", None) is not None:
             series["control"] = part_of_intervals(part.control)
         return replace(part, **series)
@@ -376,13 +387,12 @@ def _uncertain_field(network: Specification, path: str) -> tuple[Any, str]:
     parts = {part.id: part for part in getattr(network, kind)}
     if id_ not in parts:
         raise KeyError(unknown_name(kind[:-1], id_, parts))
-    fields = declarations(KINDS[kind])
     options = [
         field
-        for field, declaration in fields.items()
+        for field, declaration, _ in numbers(parts[id_])
         if isinstance(declaration, Quantity) and declaration.varies and not declaration.past
     ]
-    if "control" in fields:
+    if isinstance(parts[id_], Compartment):
         options += ["control", CAPACITY]
     if name not in options:
         raise KeyError(f"of {kind} these can be uncertain or disturbed: {', '.join(options)}; '{name}' cannot")
@@ -395,7 +405,7 @@ def _uncertain_field(network: Specification, path: str) -> tuple[Any, str]:
 
 def _number(part: Any, name: str) -> Value:
     """Return the number that is uncertain or disturbed; of a control what its deviation is of, or its upper bound."""
-    value = part.control.high if name == CAPACITY else getattr(part, name)
+    value = part.control.high if name == CAPACITY else number_of(part, name)
     number: Value = value.nominal if isinstance(value, Control) else value
     return number
 

@@ -15,11 +15,12 @@ if TYPE_CHECKING:
 
 @cache
 def _registry() -> pint.UnitRegistry[float]:
-    """Return pint's registry in which ``kt`` is the kilotonne; pint alone reads it as the knot."""
+    """Return pint's registry in which ``kt`` is the kilotonne, which pint alone reads as the knot, and ``t CO2e``."""
     import pint  # takes longer to import than most commands run
 
     registry: pint.UnitRegistry[float] = pint.UnitRegistry(on_redefinition="ignore", cache_folder=None)
     registry.define("kilotonne = 1000 * tonne = kt")
+    registry.define("CO2e = [greenhouse_effect]")
     return registry
 
 
@@ -44,6 +45,8 @@ MISSPELT = {"y": "year", "T": "t (tonne)", "MT": "Mt (megatonne)"} | dict.fromke
 """Symbols that are written for a unit, and are none or another."""
 
 
+CURRENCY = re.compile(r"[kMG]?([A-Z]{3})(_(?:18|19|20)\d\d)?")
+"""A currency, with a prefix and the year of its prices, such as ``MEUR_2023``."""
 LONGEST = 100
 """Characters of the longest unit."""
 POWER = r"(\*\*|\^)"
@@ -65,6 +68,18 @@ def _check_form(unit: str) -> None:
         raise CirlError(f"unit '{unit[:LONGEST]}': {fault}; write units as in kg, t/day, 1/day or m**3")
 
 
+def _define_currency(unit: str, symbol: str) -> None:
+    """Let pint know a currency of some year, a dimension of its own, as no factor that it knows leads to another."""
+    currency, registry = CURRENCY.fullmatch(symbol), _registry()
+    if currency is None or symbol in registry:
+        return
+    code, year = currency.groups()
+    if year is None:
+        remedy = f"if it is a currency, give the year of its prices, as in {symbol}_2023"
+        raise CirlError(f"unit '{unit}': '{symbol}' is unknown; {remedy}")
+    registry.define(f"{code}{year} = [{code}{year}]")
+
+
 @cache
 def factor(unit: str, target: str) -> float:
     """Return the number by which values in ``unit`` are multiplied to be in ``target``.
@@ -84,6 +99,7 @@ def factor(unit: str, target: str) -> float:
             raise CirlError(f"unit '{unit}': '{symbol}' is read in several ways; write {instead}")
         if symbol in MISSPELT:
             raise CirlError(f"unit '{unit}': for '{symbol}' write {MISSPELT[symbol]}")
+        _define_currency(unit, symbol)
     if unit.strip() == "-":
         raise CirlError("unit '-': write '1' for a number without unit")
     registry = _registry()

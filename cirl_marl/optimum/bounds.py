@@ -15,7 +15,9 @@ from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError, whole_number
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import frozen_record, positional_record
+from cirl_marl.network.elements import CIRCULARITY
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
+from cirl_marl.optimum.aims import NO_AIMS, Aims, account_rows, aims_of, budget_texts
 from cirl_marl.optimum.certificate import Certificate, Verification, verify
 from cirl_marl.optimum.draw_proofs import Sampling
 from cirl_marl.optimum.options import (
@@ -56,13 +58,17 @@ class Bound:
     agents: Annotated[tuple[str, ...], "who acts; the others are neutral"]
     initial: Annotated[Floats, "stocks at the start as the simulator has them, with a lifetime by stage, mass"]
     objective: Annotated[
-        float, "the bound, proved by ``verify()``: of λ̄, mass, or with a service weight of λ̄/scale + w·service"
+        float,
+        "the bound, proved by ``verify()``: of λ̄, mass, with a service weight of λ̄/scale + w·service, or of minus the "
+        "total of the account that is kept low",
     ]
-    value: Annotated[float, "the bound on λ̄, or with a service weight λ̄ of the plan, mass"]
+    value: Annotated[float, "the bound on λ̄, or with another objective λ̄ of the plan, mass"]
     service: Annotated[float, "mean service level of the plan"]
     levels: Annotated[Floats, "mean level of each service under the plan, shape (services,)"]
     service_weight: Annotated[float | None, "w; None if the objective is λ̄"]
     min_service: Annotated[Floats | None, "mean level demanded of each service, shape (services,); None for none"]
+    aims: Annotated[Aims, "whether an account is kept low in place of λ̄, and budgets of accounts"]
+    accounts: Annotated[Floats, "totals of the accounts under the plan, shape (accounts,)"]
     degree: Annotated[int, "degree of the test polynomials"]
     circularity: Annotated[Floats, "mean of λ over each interval under the plan, shape (steps,), mass"]
     stock: Annotated[Floats, "planned stocks at the start and after each interval, shape (steps + 1, stores), mass"]
@@ -78,7 +84,11 @@ class Bound:
         mass, demand = self.network.mass_unit, ""
         if self.min_service is not None and self.network.services:
             demand = f", service level at least {levels_text(self.network, self.min_service)}"
+        demand += "".join(f", {text}" for text in budget_texts(self.network, self.aims))
         statement = f"λ̄ ≤ {self.objective:.6g} {mass}{demand}"
+        if self.aims.account is not None:
+            account = self.network.accounts[self.aims.account]
+            statement = f"{account.id} ≥ {-self.objective:.6g} {account.unit}{demand}"
         if self.service_weight is not None:
             statement = f"λ̄/scale + {self.service_weight:g}·service ≤ {self.objective:.6g}"
         plan = f"λ̄ = {float(self.circularity.mean()):.6g} {mass} and serves {self.service:.4f}"
@@ -88,6 +98,18 @@ class Bound:
         idle = [arc.id for arc in self.network.arcs if arc.makes_up_for and arc.id not in agents]
         caveat = f"; {', '.join(idle)} may supply any amount within bounds in it" if idle else ""
         return f"{subject}: {statement}; its plan promises {plan}{caveat}"
+
+    @property
+    def budget_prices(self) -> dict[str, float]:
+        """What the objective gains, to first order, from one unit more of each budget, by account.
+
+        With a budget of emissions it is the price of carbon: in money where an account of money is kept low, in mass of
+        λ̄ where that is the objective. At a kink it is one of the slopes in between.
+        """
+        last = len(self.certificate.under) - (0 if self.min_service is None else len(self.network.services))
+        multipliers = self.certificate.under[last - len(self.aims.budgets) : last]
+        ids = [self.network.accounts[account].id for account in self.aims.budgets]
+        return dict(zip(ids, np.maximum(-multipliers, 0.0).tolist(), strict=True))
 
     def verify(self) -> Verification:
         """Compute the bound again from the program's matrices and the multipliers, without the solver."""
@@ -149,7 +171,7 @@ class Envelope:
         levels = None if demand is None else np.broadcast_to(demand, (*shape, demand.shape[-1]))
         bounds = np.empty(shape)
         for i in np.ndindex(shape):
-            problem = programs.program(starts[i], None if levels is None else levels[i])
+            problem = programs.program(starts[i], None if levels is None else levels[i], aims=first.aims)
             bounds[i] = min(verify(problem, member.certificate, member.solution).bound for member in self.members)
         return bounds
 
@@ -161,6 +183,8 @@ def bound(
     *,
     service_weight: float | None = None,
     min_service: ArrayLike | None = None,
+    aim: str = CIRCULARITY,
+    at_most: Mapping[str, float] | None = None,
     agents: Sequence[str] | None = None,
     scenario: str | None = None,
     horizon: int | None = None,
@@ -190,6 +214,8 @@ def bound(
     *,
     service_weight: float | None = None,
     min_service: ArrayLike | None = None,
+    aim: str = CIRCULARITY,
+    at_most: Mapping[str, float] | None = None,
     agents: Sequence[str] | None = None,
     scenario: str | None = None,
     horizon: int | None = None,
@@ -214,6 +240,8 @@ def bound(
             all in the middle, or with ``uncertain`` drawn as episodes draw them.
         service_weight: w ≥ 0; excludes ``min_service``.
         min_service: in [0, 1], for every service, or one for each, shape (services,).
+        aim: ``circularity``, or the account whose total is kept as low as can be; the bound is then on minus that.
+        at_most: budgets: the highest total of accounts, by id, in their units.
         agents: who acts; None is the network's own choice.
         scenario: scenario of the definition; None is the default.
         horizon: decisions per episode; None takes the definition's.
@@ -233,16 +261,20 @@ def bound(
     if not isinstance(uncertain, bool | np.bool_ | Sampling):
         raise CirlError(f"uncertain must be True, False or a Sampling, got {uncertain!r}")
     if isinstance(uncertain, Sampling) or uncertain:
-        if service_weight is not None or near is not None:
-            raise CirlError("uncertain: service_weight and near go with a certain future; demand min_service")
+        if service_weight is not None or near is not None or aim != CIRCULARITY or at_most:
+            options = "service_weight, near, aim and at_most"
+            raise CirlError(f"uncertain: {options} go with a certain future; demand min_service")
         levels = None if min_service is None else demanded_levels(definition, min_service)
         sampling = uncertain if isinstance(uncertain, Sampling) else Sampling()
         return uncertain_bound(definition, agents, initial, levels, degree, sampling)
+    aims = aims_of(definition, aim, at_most)
+    if service_weight is not None and aim != CIRCULARITY:
+        raise CirlError(f"service_weight goes with the aim '{CIRCULARITY}', not with '{aim}'; demand min_service")
     admissible = Admissible.of(definition, agents)
     start = starting_stocks(admissible.lifetimes, initial)
     levels = None if min_service is None else demanded_levels(admissible.network, min_service)
     basis = None if near is None else near.basis
-    return _solve_bound(Programs(admissible, degree, service_weight), start, service_weight, levels, basis)
+    return _solve_bound(Programs(admissible, degree, service_weight), start, service_weight, levels, basis, aims)
 
 
 def envelope(
@@ -311,33 +343,41 @@ def _episode_network(network: str | Path | Network, scenario: str | None, horizo
 
 
 def _solve_bound(
-    programs: Programs, start: Floats, service_weight: float | None, min_service: Floats | None, basis: Basis | None
+    programs: Programs,
+    start: Floats,
+    service_weight: float | None,
+    min_service: Floats | None,
+    basis: Basis | None,
+    aims: Aims = NO_AIMS,
 ) -> Bound:
     admissible, layout = programs.admissible, programs.layout
-    problem = programs.program(start, min_service)
+    problem = programs.program(start, min_service, aims=aims)
     request = "" if service_weight is None else f" with a service weight of {service_weight:.6g}"
     if min_service is not None and admissible.network.services:
         request = f" with a mean service level of {levels_text(admissible.network, min_service)}"
     try:
         solution = solve(problem, basis, label=f"the program of the bound{request}")
     except Infeasible:
-        raise CirlError(_unreachable(problem, min_service)) from None
+        raise CirlError(_unreachable(problem, min_service, aims)) from None
     proof = verify(problem, solution.certificate, solution.plan)
     plan = solution.plan.reshape(-1, layout.size)
     circularity = plan @ circularity_weights(layout)
     levels = plan[:, layout.level : layout.imbalance]
     lifetimes = admissible.lifetimes
+    totals, beside = account_rows(lifetimes, layout, start, range(len(plan)))
     stocks = np.concatenate([(lifetimes.start_planned @ start)[None], plan[:, layout.last]])
     return Bound(
         network=lifetimes.network,
         agents=admissible.agents,
         initial=start,
         objective=proof.bound,
-        value=proof.bound if service_weight is None else float(circularity.mean()),
+        value=proof.bound if service_weight is None and aims.account is None else float(circularity.mean()),
         service=float(levels.mean()) if levels.size else 1.0,
         levels=levels.mean(axis=0),
         service_weight=service_weight,
         min_service=min_service,
+        aims=aims,
+        accounts=totals @ solution.plan + beside,
         degree=layout.degree,
         circularity=circularity,
         stock=stocks @ lifetimes.totals.T,
@@ -350,7 +390,47 @@ def _solve_bound(
     )
 
 
-def _unreachable(problem: Program, min_service: Floats | None) -> str:
+def _unreachable(problem: Program, min_service: Floats | None, aims: Aims) -> str:
+    """Say what is wrong with a program without solution: budgets or services out of reach, with the best of each."""
+    network, last = problem.layout.network, len(problem.under_to)
+    last -= 0 if min_service is None else len(network.services)
+    budgets = range(last - len(aims.budgets), last)
+    try:
+        excesses = [_least_excess(problem, row, budgets) for row in budgets]
+    except Infeasible:  # services are out of reach whatever the budgets
+        problem = _without_rows(problem, budgets)
+        excesses = []
+    if excesses:
+        suffix = ""
+        if max(excesses) <= 0:
+            excesses, suffix = (
+                [*excesses[:-1], _least_excess(problem, last - 1, [last - 1])],
+                " beside the other budgets",
+            )
+        least = [
+            f"{text} (at least {most + excess:.6g}{suffix})"
+            for text, most, excess in zip(budget_texts(network, aims), aims.limits.tolist(), excesses, strict=True)
+            if excess > 0
+        ]
+        return f"network '{network.name}': no actions keep the budget of {', '.join(least)}"
+    return _unserved(problem, min_service)
+
+
+def _without_rows(problem: Program, rows: Sequence[int]) -> Program:
+    kept = np.delete(np.arange(len(problem.under_to)), np.array(rows, dtype=np.intp))
+    return replace(problem, under=problem.under[kept], under_to=problem.under_to[kept])
+
+
+def _least_excess(problem: Program, row: int, without: Sequence[int]) -> float:
+    """Return by how much the total of a budget's row exceeds it at least, ``without`` some rows."""
+    cost, label = problem.under[[row]].toarray()[0], "the program of the least total"
+    least = solve(replace(_without_rows(problem, without), cost=cost, constant=0.0), label=label)
+    excess = float(cost @ least.plan - problem.under_to[row])
+    size = float(np.abs(cost) @ np.maximum(np.abs(problem.low), np.abs(problem.high)))
+    return excess if excess > FEASIBLE * size else 0.0
+
+
+def _unserved(problem: Program, min_service: Floats | None) -> str:
     """Say what is wrong with a program without solution: the services out of reach, with the highest level of each."""
     network = problem.layout.network
     if min_service is None or not network.services:

@@ -68,13 +68,15 @@ def improve_plan(
     if slopes_of(bound, dynamics) > MOST_SLOPES:
         return refine(bound, enough=enough, progress=progress)
     price, lack = prices(bound), np.zeros(len(bound.network.services))
+    excess = np.zeros(len(bound.aims.budgets))
     best, run = bound, simulate_plan(bound)
     value, trust, slopes = penalised_objective(bound, run, price), TRUST, None
     for done in range(rounds):
         if trust < SMALLEST or enough(run):
             break
         slopes = jacobians(best, dynamics) if slopes is None else slopes
-        program = step_program(best, dynamics, run, np.minimum(demand(bound) + lack, 1.0), price, trust, slopes)
+        wanted, limits = np.minimum(demand(bound) + lack, 1.0), bound.aims.limits - excess
+        program = step_program(best, dynamics, run, wanted, price, trust, slopes, limits=limits)
         corrected, gain = program, 0.0
         for _ in range(1 + CORRECTIONS):
             values = best_values(corrected.problem, corrected.scale)
@@ -87,13 +89,14 @@ def improve_plan(
                 better, gain = (actions, trial), more
             elif gain > 0:
                 break
-            if gain > 0 and (demand(bound) - trial.episode_levels[0]).max(initial=0.0) <= TOLERATED_SHORTFALL:
+            if gain > 0 and shortage(bound, trial) <= TOLERATED_SHORTFALL:
                 break
             corrected = program.with_correction(values, run, trial)
         progress((done + 1) / rounds)
         if gain > 0:
             best, run = replace(best, actions=better[0]), better[1]
             lack = np.maximum(demand(bound) - run.episode_levels[0], 0.0)  # a step lacks about what the last one did
+            excess = bound.aims.excess(run)
             value, trust, slopes = value + gain, min(1.0, 2 * trust), None
         else:
             trust /= 4
@@ -102,24 +105,44 @@ def improve_plan(
 
 
 def prices(bound: Bound) -> Floats:
-    """Return what is charged for a unit that each service lacks, which covers what the certificate asks for it.
+    """Return what is charged for a unit that each service lacks, and by which each budget is exceeded.
 
-    Shape (services,); 0 if nothing is demanded.
+    It covers what the certificate asks for it. Shape (services + budgets,); 0 for services if nothing is demanded.
     """
-    services = len(bound.network.services)
-    if bound.min_service is None:
-        return np.zeros(services)
-    multipliers = -bound.certificate.under[len(bound.certificate.under) - services :]
-    return PENALTY * np.maximum(multipliers, bound.network.objective.circularity_scale)
+    network, budgets = bound.network, np.array([*bound.budget_prices.values()])
+    # what a budget is worth at least: to exceed it by all of it is as bad as all that is aimed at
+    scale = _scale(bound)
+    budgets = np.maximum(budgets, scale / np.maximum(np.abs(bound.aims.limits), np.finfo(float).tiny))
+    services = np.zeros(len(network.services))
+    if bound.min_service is not None:
+        multipliers = -bound.certificate.under[len(bound.certificate.under) - len(services) :]
+        services = np.maximum(multipliers, scale)
+    return PENALTY * np.concatenate([services, budgets])
+
+
+def _scale(bound: Bound) -> float:
+    """Return the size of the objective, which prices are no less than."""
+    if bound.service_weight is not None:
+        return 1.0
+    return bound.network.objective.circularity_scale if bound.aims.account is None else abs(bound.objective)
 
 
 def penalised_objective(bound: Bound, run: Rollout, prices: Floats) -> float:
-    """Return the objective of the bound that an episode reaches, less the price of what its services lack."""
-    circularity = float(run.episode_circularity[0])
+    """Return the objective of the bound that an episode reaches, less the price of what is short of its demands."""
     if bound.service_weight is not None:
         scale = bound.network.objective.circularity_scale
-        return circularity / scale + bound.service_weight * float(run.episode_service[0])
-    return circularity - float(prices @ np.maximum(0.0, demand(bound) - run.episode_levels[0]))
+        value = float(run.episode_circularity[0]) / scale + bound.service_weight * float(run.episode_service[0])
+    else:
+        value = bound.aims.value(run)
+    lacks = np.maximum(0.0, demand(bound) - run.episode_levels[0])
+    return value - float(prices @ np.concatenate([lacks, bound.aims.excess(run)]))
+
+
+def shortage(bound: Bound, run: Rollout) -> float:
+    """Return the most that an episode is short of a demand: of a mean level, or of a budget, relative to that."""
+    excess, limits = bound.aims.excess(run), np.abs(bound.aims.limits)
+    relative_excess = np.divide(excess, limits, out=np.where(excess > 0, np.inf, 0.0), where=limits > 0)
+    return float(max((demand(bound) - run.episode_levels[0]).max(initial=0.0), relative_excess.max(initial=0.0)))
 
 
 def demand(bound: Bound) -> Floats:
@@ -153,6 +176,7 @@ def refine(
     price, best, run = prices(bound), bound, simulate_plan(bound)
     value = penalised_objective(bound, run, price)
     factor = 1.0 + _shortfall(bound.problem.layout, bound.solution, run, 1.0)
+    excess = bound.aims.excess(run)
     for done in range(REFINEMENT_ROUNDS):
         if enough(run):
             break
@@ -161,7 +185,8 @@ def refine(
             demand_ranges, REFINEMENT_DEGREE, bound.service_weight, hold_controls=True, system=bound.problem.system
         )
         try:
-            problem = programs.program(bound.initial, bound.min_service)
+            aims = bound.aims.tightened(excess)
+            problem = programs.program(bound.initial, bound.min_service, aims=aims)
             variables = solve(problem, label="the program of a better plan", certify=False).plan
         except (Infeasible, SolverFailure):  # more than can be had: what was found so far is the plan
             break
@@ -173,9 +198,10 @@ def refine(
         if (worth := penalised_objective(bound, trial, price)) > value:
             best, run, value = candidate, trial, worth
         shortfall = _shortfall(layout, variables, trial, factor)
-        if shortfall.mean(axis=0).max(initial=0.0) <= TOLERATED_SHORTFALL:
+        if shortfall.mean(axis=0).max(initial=0.0) <= TOLERATED_SHORTFALL and not bound.aims.excess(trial).any():
             break
         factor += shortfall
+        excess += bound.aims.excess(trial)
     progress(1.0)
     return best
 

@@ -15,10 +15,12 @@ from scipy import sparse
 
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.dynamics.integrator import Dynamics
+from cirl_marl.dynamics.ledger import Ledger
 from cirl_marl.dynamics.supply import Supply
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import positional_record
+from cirl_marl.optimum.aims import Aims
 from cirl_marl.optimum.bounds import Bound
 from cirl_marl.optimum.program import LinearProgram
 from cirl_marl.optimum.window_simulator import WindowSimulator
@@ -70,16 +72,17 @@ def jacobians(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats, Floats]
 
 @positional_record
 class StepProgram:
-    """The program of the best step: δa, levels, imbalance of each interval; then what each service lacks."""
+    """The program of the best step: δa, levels, imbalance of each interval; then what services lack, and excesses."""
 
     problem: Annotated[LinearProgram, "the program"]
     scale: Annotated[Floats, "measure of each variable, shape (variables,)"]
     origin: Annotated[Floats, "its variables if nothing changes, likewise"]
     action: Annotated[Integers, "columns of δa, shape (steps, entries)"]
     level: Annotated[Integers, "columns of the levels, shape (steps, services)"]
-    lack: Annotated[Integers, "columns of what services lack, shape (services,)"]
+    lack: Annotated[Integers, "columns of what services lack and budgets are exceeded by, (services + budgets,)"]
     measured: Annotated[Integers, "interval, and row of ``measure``, of each of the first rows of G, shape (rows, 2)"]
     measure: Annotated[Floats, "what rows read off stocks and mean flows, shape (measures, stores + arcs)"]
+    aims: Annotated[Aims, "whose budgets the last rows of G keep"]
 
     def with_correction(self, values: Floats, run: Rollout, trial: Rollout) -> StepProgram:
         """Return the program with what an episode was away from what its solution promised: a second-order correction.
@@ -95,6 +98,8 @@ class StepProgram:
         moves[self.action] = values[self.action]
         limits = self.problem.under_to.copy()
         limits[: len(row)] += (after - before)[step, row] + self.problem.under[: len(row)] @ moves
+        first = len(limits) - len(self.aims.budgets)
+        limits[first:] -= self.aims.totals(trial) - self.aims.totals(run) - self.problem.under[first:] @ moves
         return replace(self, problem=replace(self.problem, under_to=limits))
 
 
@@ -107,6 +112,7 @@ def step_program(
     trust: float,
     slopes: tuple[Floats, Floats, Floats],
     margin: Floats | float = 0.0,
+    limits: Floats | None = None,
 ) -> StepProgram:
     """Return the program of the best change of the actions within a trust region, to first order.
 
@@ -118,32 +124,37 @@ def step_program(
         dynamics: of its network.
         run: the episode.
         demand: mean level demanded of each service, shape (services,).
-        price: of what each lacks, likewise.
+        price: of what each service lacks, and by which each budget is exceeded, shape (services + budgets,).
         trust: half-width of the region, in normalised actions.
         slopes: ``jacobians`` of the episode.
         margin: by how much more of a service than its band begins with counts as all of it, relative to that, shape
             (services, steps).
+        limits: budgets of accounts, shape (budgets,); None: those of the bound.
     """
-    network = bound.network
+    network, limits = bound.network, bound.aims.limits if limits is None else limits
     steps, entries = bound.actions.shape
     stocks, services, is_absolute = slopes[2], len(network.services), network.objective.net_zero == "abs"
     size = entries + services + 1
-    level, imbalance, count = entries, size - 1, size * steps + services
+    level, imbalance, count = entries, size - 1, size * steps + services + len(limits)
     step_low, step_high = np.maximum(-trust, -1 - bound.actions), np.minimum(trust, 1 - bound.actions)
     furthest = np.maximum(-step_low, step_high)
     low = np.array([network.interval_means(service.low) for service in network.services]).reshape(services, steps)
     low *= 1.0 + margin
     measure, by_stage, imbalances = _measures(bound, dynamics)
-    weights = _circularity_cost(bound, dynamics)
-    cost = np.zeros(count)
+    accounts = _account_weights(bound, dynamics)
+    is_circular = bound.aims.account is None
+    weights = _circularity_cost(bound, dynamics) if is_circular else accounts[bound.aims.account]
+    cost, spent = np.zeros(count), np.zeros((len(limits), count))
+    budgets = accounts[[*bound.aims.budgets]]
     state = np.concatenate([stocks, run.flow], axis=1)
     columns = size * np.arange(steps)[:, None] + np.arange(size)
     rows: list[sparse.csr_array] = []
-    limits: list[Floats] = []
+    rights: list[Floats] = []
     measured: list[Integers] = []
     for t, response in enumerate(_responses(*slopes[:2])):
         past = columns[: t + 1, :entries].ravel()
-        cost[past] += weights @ response
+        cost[past] += weights[t] @ response
+        spent[:, past] += budgets[:, t] @ response
         # low·level − δq ≤ q; −δx ≤ x; and ±(φ + δφ) ≤ imbalance, with q, x and φ those of the simulated episode
         table, limit, own = -by_stage @ response, by_stage @ state[t], np.zeros((len(measure), size))
         own[np.arange(services), level + np.arange(services)] = low[:, t]
@@ -154,19 +165,23 @@ def step_program(
         block = sparse.csr_array(np.concatenate([table, own[:, entries:]], axis=1)[near])
         places = np.append(past, columns[t, entries:])[block.indices]
         rows.append(sparse.csr_array((block.data, places, block.indptr), (len(near), count)))
-        limits.append(limit[near])
+        rights.append(limit[near])
         measured.append(np.stack([np.full_like(near, t), near], axis=1))
     # mean level + lack ≥ demanded level
     means = sparse.kron(np.full((1, steps), -1.0 / steps), sparse.eye_array(services, size, k=level))
-    rows.append(sparse.hstack([means, -sparse.eye_array(services)], format="csr"))
+    lacks = sparse.hstack([means, -sparse.eye_array(services), sparse.csr_array((services, len(limits)))], format="csr")
+    rows.append(lacks)
+    # what is booked − excess ≤ budget
+    spent[:, size * steps + services :] = -np.eye(len(limits))
+    rows.append(sparse.csr_array(spent))
     bounds = np.tile(np.array([0.0, np.inf]), (steps, size, 1))
     bounds[:, :entries] = np.stack([step_low, step_high], axis=2)
     bounds[:, level:imbalance, 1] = 1.0
-    lower, upper = np.concatenate([bounds.reshape(-1, 2), np.tile([0.0, np.inf], (services, 1))]).T
+    lower, upper = np.concatenate([bounds.reshape(-1, 2), np.tile([0.0, np.inf], (services + len(limits), 1))]).T
     if bound.service_weight is not None:
         cost /= network.objective.circularity_scale
         cost[columns[:, level:imbalance]] = -bound.service_weight / (steps * max(services, 1))
-    if is_absolute:
+    if is_absolute and is_circular:
         cost[columns[:, imbalance]] += (
             1.0 / steps / (1.0 if bound.service_weight is None else network.objective.circularity_scale)
         )
@@ -176,22 +191,27 @@ def step_program(
         equal=sparse.csr_array((0, count)),
         equal_to=np.empty(0),
         under=sparse.vstack(rows, format="csr"),
-        under_to=np.concatenate([*limits, -demand]),
+        under_to=np.concatenate([*rights, -demand, limits - bound.aims.totals(run)]),
         low=lower,
         high=upper,
     )
     net_flow = np.abs(run.flow @ imbalances)[:, None]
     largest = max(float(net_flow.max()), network.objective.circularity_scale)
     origin = np.concatenate([np.zeros((steps, entries)), run.levels[0].T, net_flow], axis=1)
+    size_of_excess = np.maximum(np.abs(bound.aims.totals(run)), np.abs(limits))
+    short = [np.maximum(demand - run.levels[0].mean(axis=1), 0.0), np.maximum(bound.aims.totals(run) - limits, 0.0)]
     return StepProgram(
         problem,
-        np.append(np.tile(np.append(np.ones(entries + services), largest), steps), np.ones(services)),
-        np.append(origin, np.maximum(demand - run.levels[0].mean(axis=1), 0.0)),
+        np.concatenate(
+            [np.tile(np.append(np.ones(entries + services), largest), steps), np.ones(services), size_of_excess]
+        ),
+        np.concatenate([origin.ravel(), *short]),
         columns[:, :entries],
         columns[:, level:imbalance],
-        size * steps + np.arange(services),
+        np.arange(size * steps, count),
         np.concatenate(measured),
         measure,
+        bound.aims,
     )
 
 
@@ -233,8 +253,19 @@ def _measures(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats, Floats]
 
 
 def _circularity_cost(bound: Bound, dynamics: Dynamics) -> Floats:
-    """Return minus the share of (x', f̄) of one interval in λ̄, but for an absolute imbalance."""
-    network = bound.network
+    """Return minus the share of (x', f̄) of intervals in λ̄, but for an absolute imbalance, (steps, stocks + arcs)."""
+    network, steps = bound.network, len(bound.actions)
     weights = network.circularity_weights
     counted = weights[0] if network.objective.net_zero == "abs" else weights.sum(axis=0)
-    return np.concatenate([np.zeros(dynamics.rows.nodes.stop), -counted / len(bound.actions)])
+    cost = np.concatenate([np.zeros(dynamics.rows.nodes.stop), -counted / steps])
+    return np.broadcast_to(cost, (steps, len(cost)))
+
+
+def _account_weights(bound: Bound, dynamics: Dynamics) -> Floats:
+    """Return the share of (x', f̄) of each interval in the totals of accounts, (accounts, steps, stocks + arcs)."""
+    by_flow, by_stock = Ledger(bound.network).rates()
+    by_stock[:, :-1] += by_stock[:, 1:]  # a stock ends one interval and begins the next
+    stages = np.zeros((len(bound.network.stores), dynamics.rows.nodes.stop))
+    for store in range(len(stages)):
+        stages[store, np.atleast_1d(dynamics.rows.stages.get(store, store))] = 1.0
+    return np.concatenate([by_stock / 2 @ stages, by_flow], axis=2)

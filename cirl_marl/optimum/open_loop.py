@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Any
 
 from numpy.typing import ArrayLike
 
 from cirl_marl.controllers.basic import Arrays, Planner
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network import Network
+from cirl_marl.network.elements import CIRCULARITY
 from cirl_marl.network.uncertainty import expected_network
 from cirl_marl.optimum.admissible import NoCertificate
 from cirl_marl.optimum.bounds import Bound, bound
@@ -37,6 +39,8 @@ class Optimum(Planner):
         *,
         min_service: ArrayLike | None = None,
         service_weight: float | None = None,
+        aim: str = CIRCULARITY,
+        at_most: Mapping[str, float] | None = None,
         smooth: bool | None = False,
     ) -> None:
         """Choose the objective; see ``bound``.
@@ -44,9 +48,12 @@ class Optimum(Planner):
         Args:
             min_service: see ``bound``.
             service_weight: likewise.
+            aim: likewise.
+            at_most: likewise.
             smooth: whether ``smooth_plan`` has the last word; None: where ``program_rows`` is at most MOST_ROWS.
         """
         self._min_service, self._service_weight, self._smooth = min_service, service_weight, smooth
+        self._aims: dict[str, Any] = {"aim": aim, "at_most": at_most}
         self.plans: list[Bound] | list[Incumbent] = []
         self._plan = Plan(())
 
@@ -68,6 +75,8 @@ class Optimum(Planner):
             smooth = is_small if self._smooth is None else self._smooth
             self.plans, self.note = self._bound_plans(env, network, smooth, progress), "; ".join(notes)
         except NoCertificate as reason:
+            if self._aims["aim"] != CIRCULARITY or self._aims["at_most"]:
+                raise  # what is searched for is λ̄
             self.plans = self._search_plans(env, progress)
             self.note = f"best plan found, no certificate: {reason}"
         self._plan = Plan(self.plans)
@@ -92,7 +101,8 @@ class Optimum(Planner):
                 report(1.0)
                 continue
             service, weight = self._min_service, self._service_weight
-            solution = bound(network, start, min_service=service, service_weight=weight, agents=env.agents or None)
+            options = {"min_service": service, "service_weight": weight, "agents": env.agents or None, **self._aims}
+            solution = bound(network, start, **options)
             report(0.0)
             plan = improve_plan(solution, progress=report)
             plans.append(replace(smooth_plan(plan) if smooth else plan, network=env.network))

@@ -17,6 +17,7 @@ from scipy import sparse
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import frozen_record
 from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.aims import Aims, account_rows
 from cirl_marl.optimum.constraints import (
     balances,
     constant_schedules,
@@ -176,7 +177,13 @@ class Programs:
         kind = int(self.admissible.kinds[interval])
         return self._equal.at_start(kind), self._under.at_start(kind)
 
-    def program(self, initial: Floats, min_service: ArrayLike | None = None, intervals: range | None = None) -> Program:
+    def program(
+        self,
+        initial: Floats,
+        min_service: ArrayLike | None = None,
+        intervals: range | None = None,
+        aims: Aims | None = None,
+    ) -> Program:
         """Return the program from ``initial`` that gives each service the mean level demanded of it.
 
         Args:
@@ -184,6 +191,8 @@ class Programs:
             min_service: least mean level of every service, or of each, shape (services,), to which the last rows of G
                 hold it; None if nothing is demanded.
             intervals: of the episode, one after the other; None is all of them.
+            aims: which account is kept low in place of the objective, and budgets, whose rows come before those of
+                services; None: neither.
 
         Raises:
             NoCertificate: if recipients may pull more from a node than it holds.
@@ -204,6 +213,14 @@ class Programs:
         from_start.eliminate_zeros()
         lifetime_rows, lifetime_limits = lifetimes.rows(layout, initial, intervals)
         blocks, limits = [under, from_start, lifetime_rows], [under_to, rows.limits(), lifetime_limits]
+        cost, constant = np.tile(-self._weights / steps, steps), self._constant
+        if aims is not None:
+            totals, beside = account_rows(lifetimes, layout, initial, intervals)
+            if aims.account is not None:
+                cost, constant = totals[[aims.account]].toarray()[0], -float(beside[aims.account])
+            rows_of_budgets = [*aims.budgets]
+            blocks.append(totals[rows_of_budgets])
+            limits.append(aims.limits - beside[rows_of_budgets])
         if min_service is not None:
             services = len(network.services)
             levels = sparse.eye_array(services, layout.size, k=layout.level)
@@ -212,8 +229,8 @@ class Programs:
         low, high = _box(admissible, reach, lifetime_flow, layout, period)
         return Program(
             layout=layout,
-            cost=np.tile(-self._weights / steps, steps),
-            constant=self._constant,
+            cost=cost,
+            constant=constant,
             system=self.system,
             equal=equal,
             equal_to=equal_to,

@@ -12,6 +12,7 @@ from cirl_marl.controllers.basic import Constant, Controller, Neutral, Random
 from cirl_marl.controllers.lqr import LQR
 from cirl_marl.controllers.scripted import ScriptController
 from cirl_marl.errors import CirlError, unknown_name
+from cirl_marl.network.elements import CIRCULARITY
 
 if TYPE_CHECKING:
     from cirl_marl.optimum.draws import Prices
@@ -40,6 +41,8 @@ def named_controller(
     margin: float = 1.0,
     futures: int | None = None,
     prices: Prices | None = None,
+    aim: str = CIRCULARITY,
+    at_most: Mapping[str, float] | None = None,
 ) -> Controller:
     """Return a controller, not yet started.
 
@@ -52,6 +55,8 @@ def named_controller(
         margin: by what those of TUNABLE multiply what they aim at, or divide what may lack.
         futures: that ``scenario_mpc`` plans for; None: FUTURES.
         prices: of a bound for who does not foresee, which ``price_policy`` needs.
+        aim: of ``optimum``: λ̄, or the account to keep low beside a demanded service; see ``bound``.
+        at_most: its budgets, likewise.
 
     Raises:
         CirlError: for an unknown name, or options that the controller does not take.
@@ -66,8 +71,19 @@ def named_controller(
         raise CirlError(f"a margin goes with {', '.join(TUNABLE)} control, not with {name}")
     if futures is not None and name != "scenario_mpc":
         raise CirlError(f"futures go with scenario_mpc control, not with {name}")
+    if (aim != CIRCULARITY or at_most) and name != "optimum":
+        raise CirlError(f"an aim and budgets of accounts go with optimum control, not with {name}")
+    if aim != CIRCULARITY and min_service is None:
+        raise CirlError(f"aim '{aim}': say which service is demanded beside it, as min_service, or it is least at none")
+    if name == "optimum":
+        from cirl_marl.optimum.mpc import SERVICE_FIRST
+        from cirl_marl.optimum.open_loop import Optimum
+
+        weight = SERVICE_FIRST if min_service is None else None
+        options: dict[str, Any] = {"min_service": min_service, "service_weight": weight, "smooth": smooth}
+        return Optimum(aim=aim, at_most=at_most, **options)
     if name in PLANNERS:
-        return _planner(name, min_service, smooth, margin, futures, prices)
+        return _planner(name, min_service, margin, futures, prices)
     makers: Mapping[str, Callable[[], Controller]] = {
         "neutral": Neutral,
         "constant": lambda: Constant(constants),
@@ -95,7 +111,6 @@ def controllers_by_margin(name: str, **options: Any) -> Callable[..., Controller
 def _planner(
     name: str,
     min_service: ArrayLike | None,
-    smooth: bool | None,
     margin: float,
     futures: int | None,
     prices: Prices | None,
@@ -103,14 +118,11 @@ def _planner(
     """Return one of PLANNERS, whose solvers are loaded by those who ask for them."""
     from cirl_marl.optimum.blind import BestConstant, BestSchedule
     from cirl_marl.optimum.mpc import MPC, SERVICE_FIRST
-    from cirl_marl.optimum.open_loop import Optimum
 
     demand: dict[str, Any] = {
         "min_service": min_service,
         "service_weight": SERVICE_FIRST if min_service is None else None,
     }
-    if name == "optimum":
-        return Optimum(smooth=smooth, **demand)
     demand["margin"] = margin
     if name == "price_policy":
         if prices is None:

@@ -138,13 +138,15 @@ def smooth_plan(bound: Bound, *, progress: Callable[[float], None] = lambda shar
 
 def _as_good(trial: _Episode, reference: _Episode) -> bool:
     """Whether an episode keeps λ̄, the level of each service and a weighted objective within TOLERANCE."""
-    run, standard, weight = trial.run, reference.run, trial.bound.service_weight or 0.0
-    circularity = float(standard.episode_circularity[0])
-    loss = circularity - float(run.episode_circularity[0])
+    run, standard, aims = trial.run, reference.run, trial.bound.aims
+    value, weight = aims.value(standard), trial.bound.service_weight or 0.0
+    loss = value - aims.value(run)
     lack = max(0.0, float(standard.episode_service[0] - run.episode_service[0]))
     price = weight * trial.bound.network.objective.circularity_scale
     is_served = run.episode_levels[0] >= standard.episode_levels[0] * (1 - TOLERANCE)
-    return max(loss, loss + price * lack) <= TOLERANCE * abs(circularity) and bool(is_served.all())
+    most = np.maximum(aims.limits, aims.totals(standard))
+    is_kept = (aims.totals(run) <= most + TOLERANCE * np.abs(most)).all()
+    return max(loss, loss + price * lack) <= TOLERANCE * abs(value) and bool(is_served.all() and is_kept)
 
 
 def _nearer(
@@ -172,13 +174,16 @@ def _nearer(
         margin: by how much more of each service is asked for, as trials had less than was promised.
         restore: whether to bring back what ``centre`` lost already.
     """
-    run, circularity = centre.run, float(reference.run.episode_circularity[0])
-    levels, slack = reference.run.episode_levels[0], float(run.episode_circularity[0]) - circularity
-    slack += TOLERANCE / 2 * abs(circularity)
+    run, aims = centre.run, centre.bound.aims
+    value, limits = aims.value(reference.run), np.maximum(aims.limits, aims.totals(reference.run))
+    levels, slack = reference.run.episode_levels[0], aims.value(run) - value
+    slack += TOLERANCE / 2 * abs(value)
     if not restore:
         levels, slack = np.minimum(levels, run.episode_levels[0]), max(0.0, slack)
+        limits = np.maximum(limits, aims.totals(run))
     plain = replace(centre.bound, service_weight=None)
-    program = step_program(plain, dynamics, run, levels, np.zeros_like(levels), trust, centre.slopes, margin)
+    price = np.zeros(len(levels) + len(limits))
+    program = step_program(plain, dynamics, run, levels, price, trust, centre.slopes, margin, limits)
     problem, actions = program.problem, centre.bound.actions
     count, controls, entries = len(program.origin), actions.size, actions.shape[1]
     pick = sparse.csr_array((distance.half.ravel(), (np.arange(controls), program.action.ravel())), (controls, count))

@@ -120,6 +120,8 @@ def _trajectory(simulation: Simulation, quantity: ComparedQuantity) -> tuple[Flo
         return middle, episode.circularity_mean[0]
     if quantity.kind == "service":
         return middle, episode.levels[0, [service.id for service in network.services].index(quantity.of)]
+    if quantity.kind == "account":
+        return middle, episode.booked[0, [account.id for account in network.accounts].index(quantity.of)]
     if quantity.kind == "flow":
         return middle, episode.flow[:, network.arc_index[quantity.of]]
     row = network.node_index[quantity.of]  # nodes with a stock come first

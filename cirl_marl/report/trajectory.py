@@ -16,6 +16,7 @@ from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.calendar import labels
 from cirl_marl.records.files import write_atomically, write_table
+from cirl_marl.report.account_tables import write_accounts
 from cirl_marl.report.curves import save_trajectory
 
 PYRAMID_COLUMNS, PYRAMIDS = 3, 12
@@ -26,10 +27,13 @@ def write_trajectory(folder: Path, name: str, simulation: Simulation, title: str
     """Write ``name.csv`` and ``name.png`` of a simulated episode; return their paths.
 
     The first holds the table of the episode. The picture shows λ as a mean, as it does the flows. Of a network with
-    lifetimes ``name_ages.csv`` and ``name_ages.png`` show how old what is in use is.
+    lifetimes ``name_ages.csv`` and ``name_ages.png`` show how old what is in use is, of one with accounts
+    ``name_accounts.csv`` and ``name_accounts.png`` what each compartment books.
     """
     network = simulation.env.network
     files = [simulation.write(folder / f"{name}.csv"), draw_trajectory(folder / f"{name}.png", simulation, title=title)]
+    if network.accounts:
+        files += write_accounts(folder, name, simulation, title)
     if of_ages := pyramids(network, simulation.rollout, simulation.rollout.start):
         ages, bars = folder / f"{name}_ages.csv", folder / f"{name}_ages.png"
         write_atomically(ages, lambda draft: write_table(draft, *ages_table(network, of_ages)))

@@ -14,6 +14,7 @@ from cirl_marl.network.specification import Specification
 from cirl_marl.network.split_fractions import splits, trap_problems
 from cirl_marl.network.uncertainty import uncertainty_problems
 from cirl_marl.network.units import factor
+from cirl_marl.network.validation.accounts import account_problems
 from cirl_marl.network.validation.compartments import arc_problems, node_problems, port_problems
 from cirl_marl.network.validation.services import service_problems, supply_problems
 from cirl_marl.network.validation.settings import calendar_problems, repetitions, setting_problems
@@ -42,6 +43,8 @@ def problems(network: Specification) -> Iterator[str]:
         return  # such models cannot be asked for more
     yield from _name_problems([*(("node", n.id) for n in network.nodes), *(("arc", a.id) for a in network.arcs)])
     yield from _name_problems([("service", service.id) for service in network.services])
+    yield from _name_problems([("account", account.id) for account in network.accounts])
+    yield from account_problems(network)
     nodes = {node.id: node for node in network.nodes}
     compartments = {c.id: c for c in (*network.nodes, *network.arcs)}
     outflows: dict[str, list[Arc]] = {}

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from cirl_marl.network.calendar import labels
-from cirl_marl.network.declarations import Quantity, bound_problems, declarations, default_of
+from cirl_marl.network.declarations import Quantity, bound_problems, default_of, numbers
 from cirl_marl.network.elements import (
     FIXED_LIFETIME,
     MAX_STEPS,
@@ -81,8 +81,7 @@ def series_problems(network: Specification) -> Iterator[str]:
     owners: list[tuple[str, Any]] = [(f"{type(part).__name__.lower()} '{part.id}': ", part) for part in parts]
     owners += [(f"{prefix}control.", c.control) for prefix, c in owners if isinstance(c, Compartment) and c.control]
     for prefix, part in owners:
-        for name, declaration in declarations(type(part)).items():
-            value = getattr(part, name)
+        for name, declaration, value in numbers(part):
             if isinstance(value, Series):
                 past = isinstance(declaration, Quantity) and declaration.past
                 faults = list(value.problems())

@@ -1,0 +1,100 @@
+"""What an interval costs, emits or needs: amounts on accounts, read off mean flows and stocks.
+
+An interval of length h books a·f̄·h for each mass that flows along an arc, or enters a node, and b·(x + x')/2·h for
+what a node holds, x and x' being its stock at the start and at the end. Both are linear in flows and stocks, so that
+programs bound them exactly. Nothing that is booked changes what moves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from cirl_marl.dynamics.uncertain_factors import RowFactors
+from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.declarations import Rates, declarations
+from cirl_marl.network.rowsum import RowSum
+from cirl_marl.network.units import factor
+
+
+class Ledger:
+    """The entries of the accounts of a network: one for each rate that a compartment states.
+
+    Attributes:
+        accounts: ids of the accounts.
+        compartments: id of the compartment that each entry is of.
+        account: position of the account of each entry, shape (entries,).
+        discount: by which amounts of each interval are multiplied in totals, shape (accounts, horizon).
+    """
+
+    def __init__(self, network: Network, ranges: Mapping[str, tuple[float, float]] | None = None) -> None:
+        """Find them; ``ranges`` are of all factors on numbers that are not certain, None if there are none."""
+        self._network, numbers = network, {path: row for row, path in enumerate(ranges or ())}
+        self.accounts = tuple(account.id for account in network.accounts)
+        self._interval = network.episode.control_interval
+        inflows: list[list[int]] = [[] for _ in network.nodes]
+        for k, recipient in enumerate(network.recipients.tolist()):
+            inflows[recipient].append(k)
+        arcs, entries = len(network.arcs), []
+        for kind, parts in (("nodes", network.nodes), ("arcs", network.arcs)):
+            for i, part in enumerate(parts):
+                for name, declaration in declarations(type(part)).items():
+                    if not isinstance(declaration, Rates):
+                        continue
+                    holds = declaration.per == "stock"
+                    charged = [arcs + i] if holds else inflows[i] if kind == "nodes" else [i]
+                    for account, rate in getattr(part, name):
+                        path = f"{kind}.{part.id}.{name}.{account}"
+                        entries.append((part.id, self.accounts.index(account), charged, rate, numbers.get(path)))
+        self.compartments = tuple(entry[0] for entry in entries)
+        self.account: Integers = np.array([entry[1] for entry in entries], dtype=np.intp)
+        places = [(row, column) for row, entry in enumerate(entries) for column in entry[2]]
+        rows, columns = np.array(places, dtype=np.intp).reshape(-1, 2).T
+        self._charged = RowSum(rows, columns, 1.0, (len(entries), arcs + len(network.stores)))
+        self._places = rows, columns
+        self._by_account = RowSum(self.account, range(len(entries)), 1.0, (len(self.accounts), len(entries)))
+        horizon = network.episode.horizon
+        rates = [network.interval_means(entry[3]) for entry in entries]
+        table = np.array(rates).reshape(len(entries), horizon)
+        constant = all(rate.strides[-1] == 0 for rate in rates)
+        self._rates = table[:, :1] if constant else table
+        self._factors = RowFactors({row: entry[4] for row, entry in enumerate(entries) if entry[4] is not None})
+        middle = (np.arange(horizon) + 0.5) * self._interval * factor(network.time_unit, "year")
+        growth = np.array([1.0 + account.discount for account in network.accounts]).reshape(-1, 1)
+        self.discount: Floats = growth**-middle
+
+    def entries(
+        self, flow: Floats, before: Floats, after: Floats, step: Integers, factors: Floats | None = None
+    ) -> Floats:
+        """Return the amount of each entry in the interval ``step`` of each copy, not discounted, shape (entries, B).
+
+        Args:
+            flow: mean flows, shape (arcs, B), mass/time.
+            before: stocks at the start, shape (stores, B), mass.
+            after: stocks at the end, likewise.
+            step: the interval, shape (B,).
+            factors: those on numbers that are not certain, shape (numbers, B).
+        """
+        rates = self._rates if self._rates.shape[1] == 1 else self._rates.take(step, axis=1)
+        rates = self._factors(rates, factors)
+        amounts: Floats = self._charged(np.concatenate([flow, (before + after) / 2])) * rates * self._interval
+        return amounts
+
+    def sums(self, entries: Floats) -> Floats:
+        """Return the amount on each account, shape (accounts, B), of those of entries."""
+        return self._by_account(entries)
+
+    def rates(self) -> tuple[Floats, Floats]:
+        """Return what totals have of mean flows and of mean stocks of each interval, discounted.
+
+        Shapes are (accounts, horizon, arcs) and (accounts, horizon, stores), in amounts per mass/time and per mass.
+        """
+        horizon, arcs = self.discount.shape[1], len(self._network.arcs)
+        table = np.zeros((len(self.accounts), horizon, self._charged.shape[1]))
+        rows, columns = self._places
+        rates = np.broadcast_to(self._rates, (len(self._rates), horizon))
+        for row, column in zip(rows.tolist(), columns.tolist(), strict=True):
+            table[self.account[row], :, column] += rates[row]
+        table *= (self.discount * self._interval)[:, :, None]
+        return table[..., :arcs], table[..., arcs:]

@@ -1,0 +1,37 @@
+"""What is wrong with the accounts of a network, and with what is booked on them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from cirl_marl.errors import CirlError, unknown_name
+from cirl_marl.network.declarations import Rates, bound_problems, declarations
+from cirl_marl.network.elements import CIRCULARITY, Node
+from cirl_marl.network.specification import Specification
+from cirl_marl.network.units import factor
+
+RESERVED = (CIRCULARITY, "service_level")
+"""Ids that no account may have."""
+
+
+def account_problems(network: Specification) -> Iterator[str]:
+    """Yield every mistake in the accounts of ``network``."""
+    for account in network.accounts:
+        subject = f"account '{account.id}'"
+        yield from bound_problems(account, f"{subject}: ")
+        if account.id in RESERVED:
+            yield f"{subject}: the id names a figure of every episode; choose another"
+        try:
+            factor(account.unit, account.unit)
+        except CirlError as error:
+            yield f"{subject}: {error}"
+    accounts = [account.id for account in network.accounts]
+    for part in (*network.nodes, *network.arcs):
+        subject = f"{type(part).__name__.lower()} '{part.id}'"
+        for name, declaration in declarations(type(part)).items():
+            if isinstance(declaration, Rates):
+                for account, _ in getattr(part, name):
+                    if account not in accounts:
+                        yield f"{subject}: {name}: {unknown_name('account', account, accounts)}"
+        if isinstance(part, Node) and part.holding and not part.stores:
+            yield f"{subject}: holding: it stores nothing; charge what enters it, under accounts"

@@ -1,0 +1,392 @@
+"""Money, emissions and energy beside mass: what is booked, bounds and plans for it, budgets, files and messages."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import random_network
+from hypothesis import given
+from hypothesis import strategies as st
+from small_networks import plain_networks, small
+from test_optimum import bounded, certifiable, pinned
+from typer.testing import CliRunner
+
+from cirl_marl import (
+    Account,
+    Arc,
+    CirlError,
+    Law,
+    MultiAgentVectorEnv,
+    Network,
+    NetworkError,
+    Node,
+    Role,
+    Series,
+    load_network,
+    parallel_env,
+    plan,
+    write_network,
+)
+from cirl_marl.cli import app
+from cirl_marl.controllers import Random
+from cirl_marl.controllers.rollout import rollout
+from cirl_marl.dynamics.ledger import Ledger
+from cirl_marl.network.disturbances import DisturbanceEffect, Markov
+from cirl_marl.network.uncertainty import Spread
+from cirl_marl.network.units import factor
+from cirl_marl.optimum import bound, improve, improve_plan, simulate_plan, smooth_plan
+
+ACCOUNTS = (Account(id="cost", unit="EUR_2023", discount=0.04), Account(id="emissions", unit="t CO2e"))
+
+
+def booked(network: Network, seed: int, *, credits: bool = True) -> Network:
+    """Return a network whose compartments book random amounts, some of which change in time."""
+    rng = np.random.default_rng([seed, 7])
+    length = network.episode.control_interval * network.episode.horizon
+
+    def rates() -> dict[str, float | Series]:
+        chosen: dict[str, float | Series] = {}
+        for account in ("cost", "emissions"):
+            value = float(rng.normal() if credits else abs(rng.normal()))
+            if rng.random() < 0.6:
+                step = Series(times=(0.0, length / 3), values=(value, 2 * value))
+                chosen[account] = step if rng.random() < 0.3 else value
+        return chosen
+
+    nodes = tuple(replace(n, accounts=rates(), holding=rates() if n.stores else {}) for n in network.nodes)
+    arcs = tuple(replace(a, accounts=rates()) for a in network.arcs)
+    return replace(network, nodes=nodes, arcs=arcs, accounts=ACCOUNTS, scenarios={})
+
+
+def with_lambda(network: Network) -> Network:
+    """Return a network with an account of what moves finite-time sustainably: −λ̄·T/Δ if nothing is absolute."""
+    signs = zip(network.arcs, network.sustainability.tolist(), strict=True)
+    arcs = tuple(replace(arc, accounts={"moved": sign}) for arc, sign in signs)
+    return replace(network, arcs=arcs, accounts=(Account(id="moved", unit=network.mass_unit),), scenarios={})
+
+
+def city() -> Network:
+    """Return the paper cycle of a city in which recycled fibre is cheaper than virgin one, and emits more."""
+    network = load_network("paper_city")
+    costs = {"virgin_fibre": 600.0, "collection": 40.0, "feed": 90.0, "bales_to_mill": 15.0}
+    emissions = {"virgin_fibre": 0.2, "feed": 0.6, "bales_to_mill": 0.5}
+    arcs = tuple(
+        replace(
+            arc,
+            accounts={
+                **({"cost": costs[arc.id]} if arc.id in costs else {}),
+                **({"emissions": emissions[arc.id]} if arc.id in emissions else {}),
+            },
+        )
+        for arc in network.arcs
+    )
+    nodes = tuple(replace(n, holding={"cost": 0.5}) if n.id in ("hall", "bales") else n for n in network.nodes)
+    return replace(network, name="city", arcs=arcs, nodes=nodes, accounts=ACCOUNTS, scenarios={})
+
+
+def test_what_decays_books_what_left_and_what_was_held() -> None:
+    """X' = −a·x: flows book c·(x₀ − x_T), discounted by year; stocks book the mean of their ends."""
+    network = small({"store": 100.0, "sink": 0.0}, [Arc(id="out", donor="store", recipient="sink", rate=0.2)])
+    store, sink = network.nodes
+    network = replace(
+        network,
+        nodes=(replace(store, holding={"cost": 3.0}), replace(sink, accounts={"emissions": 0.5})),
+        arcs=(replace(network.arcs[0], accounts={"cost": 7.0}),),
+        accounts=(Account(id="cost", unit="EUR_2023", discount=0.5), Account(id="emissions", unit="t CO2e")),
+        time_unit="year",
+    )
+    run = rollout(MultiAgentVectorEnv(network, num_envs=2), Random())
+    stock = 100.0 * np.exp(-0.2 * np.arange(6))
+    left, held = stock[:-1] - stock[1:], (stock[:-1] + stock[1:]) / 2
+    np.testing.assert_allclose(run.booked[0], [7 * left + 3 * held, 0.5 * left], rtol=1e-12)
+    discounted = (7 * left + 3 * held) @ 1.5 ** -(np.arange(5) + 0.5)
+    np.testing.assert_allclose(run.accounts[1], [discounted, 0.5 * left.sum()], rtol=1e-12)
+
+
+@given(seed=st.integers(0, 10_000), nodes=st.integers(2, 8), arcs=st.integers(1, 16), lifetimes=st.booleans())
+def test_every_view_books_the_same(seed: int, nodes: int, arcs: int, lifetimes: bool) -> None:
+    """Copies alone and together, infos, rollouts and rates agree; what enters a node is what its arcs bring."""
+    network = booked(random_network(seed, nodes, arcs, lifetimes=lifetimes), seed)
+    env, steps = MultiAgentVectorEnv(network, num_envs=3), network.episode.horizon
+    run = rollout(env, Random(), seed=seed)
+    ledger = Ledger(network)
+    by_flow, by_stock = ledger.rates()
+    stock = np.concatenate([run.start[None], run.stock])
+    totals = (by_flow * run.flow).sum(axis=(1, 2)) + (by_stock * (stock[1:] + stock[:-1]) / 2).sum(axis=(1, 2))
+    size = (abs(by_flow) * run.flow).sum(axis=(1, 2)) + (abs(by_stock) * (stock[1:] + stock[:-1]) / 2).sum(axis=(1, 2))
+    np.testing.assert_allclose(run.accounts[0], totals, atol=float(1e-12 * size.max(initial=1.0)))
+    np.testing.assert_array_equal(ledger.sums(run.entries.T).T, run.booked[0].T)
+    alone = rollout(MultiAgentVectorEnv(network, num_envs=1), Random(), seed=seed)
+    if np.array_equal(alone.flow, run.flow):  # who acts at random may act otherwise alone
+        np.testing.assert_array_equal(alone.accounts[0], run.accounts[0])
+    moved = [
+        replace(
+            arc,
+            accounts={a: _sum(dict(arc.accounts), dict(network.nodes[i].accounts), a) for a in ("cost", "emissions")},
+        )
+        for arc, i in zip(network.arcs, network.recipients.tolist(), strict=True)
+    ]
+    elsewhere = replace(network, nodes=tuple(replace(n, accounts={}) for n in network.nodes), arcs=tuple(moved))
+    other = rollout(MultiAgentVectorEnv(elsewhere, num_envs=3), Random(), seed=seed)
+    np.testing.assert_allclose(other.accounts, run.accounts, atol=float(1e-12 * size.max(initial=1.0)))
+    assert run.booked.shape == (3, 2, steps)
+
+
+def _sum(first: dict[str, float | Series], second: dict[str, float | Series], account: str) -> float | Series:
+    a, b = first.get(account, 0.0), second.get(account, 0.0)
+    series = next((x for x in (a, b) if isinstance(x, Series)), None)
+    if series is None:
+        assert not isinstance(a, Series) and not isinstance(b, Series)
+        return a + b
+    values = [np.array(x.values) if isinstance(x, Series) else np.full(2, x) for x in (a, b)]
+    return replace(series, values=tuple((values[0] + values[1]).tolist()))
+
+
+def test_infos_hold_what_each_interval_and_the_episode_book() -> None:
+    """The parallel view tells amounts as numbers, and totals of the episode at its end."""
+    env = parallel_env(city(), horizon=3)
+    env.reset(seed=1)
+    sums = np.zeros(2)
+    for _ in range(3):
+        *_, infos = env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+        info = next(iter(infos.values()))
+        sums += [info["accounts"][account.id] for account in ACCOUNTS]
+    batch = MultiAgentVectorEnv(city(), num_envs=2, horizon=3)
+    batch.reset(seed=1)
+    for _ in range(3):
+        *_, infos = batch.step(batch.neutral_action)
+    final = next(iter(infos.values()))["final_info"]
+    assert final["episode_emissions"].shape == final["episode_cost"].shape == (2,)
+    assert (final["episode_emissions"] > 0).all() and (sums > 0).all()
+
+
+@given(network=plain_networks)
+def test_an_account_of_lambda_has_the_bound_and_the_plan_of_lambda(network: Network) -> None:
+    """Two ways to ask for the same thing: keep λ̄ high, or what it counts low."""
+    network = certifiable(network, 0.2, pulls=False)
+    network = with_lambda(replace(network, objective=replace(network.objective, net_zero="signed")))
+    episode = network.episode
+    scale = network.objective.reference_interval / (episode.horizon * episode.control_interval)
+    high, low = bound(network), bound(network, aim="moved")
+    size = scale * float(abs(high.problem.cost) @ np.maximum(abs(high.problem.low), abs(high.problem.high))) / scale
+    assert low.objective * scale == pytest.approx(high.objective, abs=1e-5 * max(size, 1e-9))
+    run = simulate_plan(low)
+    assert -float(run.accounts[0, 0]) * scale == pytest.approx(
+        float(run.episode_circularity[0]), abs=1e-9 * size + 1e-9
+    )
+
+
+@pytest.mark.medium
+@given(
+    network=st.from_type(Network), interval=st.floats(0.02, 0.4), seed=st.integers(0, 1000), aim=st.sampled_from([0, 1])
+)
+def test_no_episode_books_less_than_the_bound(network: Network, interval: float, seed: int, aim: int) -> None:
+    """Random actions on random networks with random rates; with a budget, no episode that keeps it has a higher λ̄."""
+    network = booked(bounded(network, interval).network, seed)
+    account = ACCOUNTS[aim].id
+    least = bound(network, network.initial[1], aim=account)
+    run = rollout(MultiAgentVectorEnv(pinned(least), num_envs=24), Random(), seed=seed)
+    totals = run.accounts[:, aim]
+    size = float(abs(least.problem.cost) @ np.maximum(abs(least.problem.low), abs(least.problem.high)))
+    assert (totals >= -least.objective - 1e-9 * max(size, 1.0)).all()
+    assert least.verify().bound == least.objective
+    budget = float(np.median(totals))
+    kept = totals <= budget
+    best = bound(network, network.initial[1], at_most={account: budget})
+    scale = max(float(abs(best.problem.cost) @ np.maximum(abs(best.problem.low), abs(best.problem.high))), 1.0)
+    assert (run.episode_circularity[kept] <= best.objective + 1e-9 * scale).all()
+
+
+def test_budgets_are_kept_at_a_price_between_the_difference_quotients() -> None:
+    """The multiplier of a budget of carbon is its price, within 1 % of quotients of solved programs."""
+    network = city()
+    free = bound(network, min_service=0.95)
+    least = bound(network, aim="emissions", min_service=0.95)
+    budget = float(0.5 * (free.accounts[1] - least.objective))
+    assert free.accounts[1] > budget > -least.objective
+    for aim in ("circularity", "cost"):
+        solved = bound(network, aim=aim, min_service=0.95, at_most={"emissions": budget})
+        step = 1e-3 * budget
+        lower, higher = (
+            bound(network, aim=aim, min_service=0.95, at_most={"emissions": budget + way * step}).objective
+            for way in (-1, 1)
+        )
+        price, quotients = (
+            solved.budget_prices["emissions"],
+            sorted([solved.objective - lower, higher - solved.objective]),
+        )
+        assert 0.99 * quotients[0] / step <= price <= 1.01 * quotients[1] / step
+        assert solved.accounts[1] <= budget * (1 + 1e-6)
+        run = simulate_plan(smooth_plan(improve_plan(solved)))
+        assert run.accounts[0, 1] <= budget * (1 + 1e-4)
+        assert run.episode_levels[0, 0] >= 0.95 - 1e-4  # of a band with an upper end the lower one alone counts
+        assert solved.gap(solved.aims.value(run)) <= 0.01
+
+
+def test_large_plans_keep_budgets(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plans without Jacobians tighten a budget by what was booked too much."""
+    monkeypatch.setattr(improve, "MOST_SLOPES", 0)
+    network = city()
+    least = -bound(network, aim="emissions", min_service=0.9).objective
+    solved = bound(network, min_service=0.9, at_most={"emissions": 1.1 * least})
+    run = simulate_plan(improve_plan(solved))
+    assert run.accounts[0, 1] <= 1.1 * least * (1 + 1e-3)
+    assert solved.gap(solved.aims.value(run)) <= 0.02
+
+
+def test_what_cannot_be_asked_for_is_told() -> None:
+    """Budgets out of reach, alone or together, unknown accounts, two aims at once."""
+    network = city()
+    least = {a.id: -bound(network, aim=a.id, min_service=0.95).objective for a in ACCOUNTS}
+    with pytest.raises(CirlError, match=r"no actions keep the budget of emissions at most .* \(at least ") as raised:
+        bound(network, min_service=0.95, at_most={"emissions": 0.5 * least["emissions"]})
+    told = float(str(raised.value).rpartition("at least ")[2].rstrip(")"))
+    assert told == pytest.approx(least["emissions"], rel=1e-4)
+    delivered, *others = network.services
+    hungry = replace(network, services=(replace(delivered, low=1e6), *others))
+    with pytest.raises(CirlError, match=r"no actions reach a mean service level of 0.9 of 'paper_delivered'"):
+        bound(hungry, min_service=0.9, at_most={"emissions": 1e9})
+    for options, message in (
+        ({"aim": "costs"}, "Did you mean 'cost'"),
+        ({"at_most": {"emission": 1.0}}, "Did you mean 'emissions'"),
+        ({"at_most": {"cost": float("nan")}}, "must be a finite number"),
+        ({"aim": "cost", "at_most": {"cost": 1.0}}, "kept as low as can be already"),
+        ({"aim": "cost", "service_weight": 1.0}, "service_weight goes with"),
+        ({"aim": "cost", "uncertain": True}, "go with a certain future"),
+    ):
+        with pytest.raises(CirlError, match=message):
+            bound(network, **options)
+    with pytest.raises(CirlError, match="say which service is demanded"):
+        plan(network, "optimum", aim="cost")
+    with pytest.raises(CirlError, match="go with --control optimum"):
+        plan(network, "mpc", at_most={"cost": 1.0})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"accounts": (Account(id="cost", unit="EUR"),)}, "give the year of its prices, as in EUR_2023"),
+        ({"accounts": (Account(id="cost", unit="EUR_2023", discount=-1.0),)}, r"must lie in \[-0.99, 10\]"),
+        ({"accounts": (Account(id="cost", unit="appels"),)}, "cannot be read"),
+        ({"accounts": (Account(id="circularity", unit="t"),)}, "names a figure of every episode"),
+        ({"accounts": (Account(id="cost", unit="t"), Account(id="cost", unit="t"))}, "used twice"),
+        ({"accounts": (Account(id="costs", unit="EUR_2023"),)}, "Did you mean 'costs'"),
+    ],
+)
+def test_accounts_that_cannot_be_meant_are_refused(change: dict[str, object], message: str) -> None:
+    """Units, discounts, ids and rates of accounts that there are not."""
+    network = small({"store": 1.0, "sink": 0.0}, [Arc(id="out", donor="store", recipient="sink", rate=0.2)])
+    network = replace(network, accounts=(Account(id="cost", unit="EUR_2023"),))
+    network = replace(network, arcs=(replace(network.arcs[0], accounts={"cost": 1.0}),))
+    with pytest.raises(NetworkError, match=message):
+        replace(network, **change)
+    with pytest.raises(NetworkError, match="accounts must be 'cost': a number, got 'much'"):
+        replace(network.arcs[0], accounts={"cost": "much"})
+    with pytest.raises(NetworkError, match="it stores nothing; charge what enters it"):
+        replace(
+            network,
+            nodes=(*network.nodes, Node(id="market", role=Role.TECHNOSPHERE, stores=False, holding={"cost": 1.0})),
+            arcs=(
+                *network.arcs,
+                Arc(id="into", donor="store", recipient="market", rate=0.1),
+                Arc(id="from", donor="market", recipient="sink", law=Law.SHARE),
+            ),
+        )
+
+
+@given(seed=st.integers(0, 10_000))
+def test_a_file_reads_back_what_is_booked(seed: int) -> None:
+    """Rates in time, uncertain and disturbed ones go to a definition and back to the last bit."""
+    import tempfile
+
+    network = booked(random_network(seed, 5, 8), seed)
+    arcs = [arc for arc in network.arcs if any(value == value and rate > 0 for value, rate in _plain(arc))]
+    if arcs:
+        account, _ = next(pair for pair in _plain(arcs[0]) if pair[1] > 0)
+        path = f"arcs.{arcs[0].id}.accounts.{account}"
+        network = replace(network, uncertain={path: Spread(deviation=0.1)})
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "random.toml"
+        write_network(network, file)
+        again = load_network(file)
+    assert (again.accounts, again.nodes, again.arcs, again.uncertain) == (
+        network.accounts,
+        network.nodes,
+        network.arcs,
+        network.uncertain,
+    )
+
+
+def _plain(arc: Arc) -> list[tuple[str, float]]:
+    return [(account, rate) for account, rate in arc.accounts if not isinstance(rate, Series)]
+
+
+def test_units_of_files_are_converted_and_refused(tmp_path: Path) -> None:
+    """Rates come in any unit of the account per mass; another currency, or a mass for emissions, is an error."""
+    file = tmp_path / "city.toml"
+    write_network(city(), file)
+    text = file.read_text(encoding="utf-8")
+    assert factor("MEUR_2023/kt", "EUR_2023/t") == pytest.approx(1000.0)
+    rate = 'cost = {value = 600.0, unit = "(EUR_2023)/(t)"'
+    assert rate in text
+    file.write_text(text.replace(rate, 'cost = {value = 0.6, unit = "kEUR_2023/t"'), encoding="utf-8")
+    assert dict(load_network(file).arcs[10].accounts)["cost"] == pytest.approx(600.0)
+    for wrong, message in (
+        ('cost = {value = 600.0, unit = "USD_2023/t"', "'USD_2023/t' is inconsistent"),
+        ('cost = {value = 600.0, unit = "EUR/t"', "give the year of its prices"),
+        ('cost = {value = 600.0, unit = "t/t"', "is inconsistent"),
+        ('costs = {value = 600.0, unit = "EUR_2023/t"', "Did you mean 'cost'"),
+    ):
+        file.write_text(text.replace(rate, wrong), encoding="utf-8")
+        with pytest.raises(CirlError, match=f"arcs.virgin_fibre.accounts.*{message}"):
+            load_network(file)
+
+
+def test_uncertain_and_disturbed_prices_are_each_copy_s_own() -> None:
+    """A drawn price multiplies what a copy books, a disturbed one what an interval does; flows stay as they are."""
+    regime = Markov(values=(1.0, 3.0), matrix=((0.5, 0.5), (0.5, 0.5)))
+    plain = city()
+    network = replace(
+        plain,
+        uncertain={"arcs.virgin_fibre.accounts.cost": Spread(low=0.5, high=1.5, distribution="uniform")},
+        disturbances={"carbon": regime},
+        disturbed={"arcs.virgin_fibre.accounts.emissions": DisturbanceEffect(by="carbon")},
+        nodes=tuple(replace(n, accounts={}, holding={}) for n in plain.nodes),
+        arcs=tuple(replace(a, accounts=a.accounts if a.id == "virgin_fibre" else {}) for a in plain.arcs),
+        accounts=tuple(replace(account, discount=0.0) for account in ACCOUNTS),
+    )
+    env = MultiAgentVectorEnv(network, num_envs=4, uncertain=True)
+    run = rollout(env, Random())
+    fibre = network.arc_index["virgin_fibre"]
+    draws = env.physical.factors[0]
+    assert len(set(draws.tolist())) == 4
+    np.testing.assert_allclose(run.booked[0, 0], 600 * draws[0] * run.flow[:, fibre], rtol=1e-12)
+    np.testing.assert_allclose(run.booked[0, 1], 0.2 * run.disturbances[0, :, 0] * run.flow[:, fibre], rtol=1e-12)
+    certain = env.certain_network(0)
+    again = Ledger(certain).rates()[0] * run.flow
+    np.testing.assert_allclose(again.sum(axis=(1, 2)), run.accounts[0], rtol=1e-12)
+
+
+def test_the_command_line_writes_and_plans(tmp_path: Path) -> None:
+    """``simulate`` says totals and writes who books what; ``plan`` keeps costs low under a budget."""
+    file = tmp_path / "city.toml"
+    write_network(city(), file)
+    result = CliRunner().invoke(app, ["simulate", str(file), "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    assert "accounts: cost" in result.output
+    with (tmp_path / "city_neutral_accounts.csv").open(encoding="utf-8") as lines:
+        rows = list(csv.DictReader(lines))
+    sums = sum(float(row["discounted"]) for row in rows if row["account"] == "cost")
+    assert f"cost {sums:.5g} EUR_2023" in " ".join(result.output.split())
+    assert (tmp_path / "city_neutral_accounts.png").stat().st_size > 1000
+    asked = ["--control", "optimum", "--min-service", "0.9", "--aim", "cost", "--at-most"]
+    out = ["--out", str(tmp_path / "p.csv")]
+    result = CliRunner().invoke(app, ["plan", str(file), *asked, "emissions=100000", *out])
+    assert result.exit_code == 0, result.output
+    assert "cost ≥" in result.output and "emissions at most 100000 t CO2e" in " ".join(result.output.split())
+    result = CliRunner().invoke(app, ["plan", str(file), *asked, "emissions", *out])
+    assert "needs ACCOUNT=TOTAL" in str(result.exception)
