@@ -52,6 +52,8 @@ if TYPE_CHECKING:
     from cirl_marl.errors import NetworkError as NetworkError
     from cirl_marl.errors import RecipeError as RecipeError
     from cirl_marl.errors import RunError as RunError
+    from cirl_marl.evaluation.account_front import AccountFront as AccountFront
+    from cirl_marl.evaluation.account_front import account_front as account_front
     from cirl_marl.evaluation.assessment import Evaluation as Evaluation
     from cirl_marl.evaluation.assessment import evaluate as evaluate
     from cirl_marl.evaluation.comparison import Comparison as Comparison
@@ -139,6 +141,7 @@ _MODULES = {
     "evaluation.assessment": "Evaluation evaluate",
     "evaluation.comparison": "Comparison compare",
     "evaluation.levers": "Levers levers",
+    "evaluation.account_front": "AccountFront account_front",
     "evaluation.pareto": "ParetoFront pareto_front",
     "evaluation.plans": "plan",
     "evaluation.simulations": "Simulation simulate simulate_alternatives",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from cirl_marl import (
     Node,
     Role,
     Series,
+    account_front,
     load_network,
     parallel_env,
     plan,
@@ -277,7 +279,7 @@ def test_what_cannot_be_asked_for_is_told() -> None:
         ({"accounts": (Account(id="costs", unit="EUR_2023"),)}, "Did you mean 'costs'"),
     ],
 )
-def test_accounts_that_cannot_be_meant_are_refused(change: dict[str, object], message: str) -> None:
+def test_accounts_that_cannot_be_meant_are_refused(change: dict[str, Any], message: str) -> None:
     """Units, discounts, ids and rates of accounts that there are not."""
     network = small({"store": 1.0, "sink": 0.0}, [Arc(id="out", donor="store", recipient="sink", rate=0.2)])
     network = replace(network, accounts=(Account(id="cost", unit="EUR_2023"),))
@@ -285,7 +287,8 @@ def test_accounts_that_cannot_be_meant_are_refused(change: dict[str, object], me
     with pytest.raises(NetworkError, match=message):
         replace(network, **change)
     with pytest.raises(NetworkError, match="accounts must be 'cost': a number, got 'much'"):
-        replace(network.arcs[0], accounts={"cost": "much"})
+        much: Any = {"cost": "much"}
+        replace(network.arcs[0], accounts=much)
     with pytest.raises(NetworkError, match="it stores nothing; charge what enters it"):
         replace(
             network,
@@ -322,7 +325,7 @@ def test_a_file_reads_back_what_is_booked(seed: int) -> None:
 
 
 def _plain(arc: Arc) -> list[tuple[str, float]]:
-    return [(account, rate) for account, rate in arc.accounts if not isinstance(rate, Series)]
+    return [(account, rate) for account, rate in dict(arc.accounts).items() if not isinstance(rate, Series)]
 
 
 def test_units_of_files_are_converted_and_refused(tmp_path: Path) -> None:
@@ -390,3 +393,28 @@ def test_the_command_line_writes_and_plans(tmp_path: Path) -> None:
     assert "cost ≥" in result.output and "emissions at most 100000 t CO2e" in " ".join(result.output.split())
     result = CliRunner().invoke(app, ["plan", str(file), *asked, "emissions", *out])
     assert "needs ACCOUNT=TOTAL" in str(result.exception)
+
+
+def test_the_front_of_two_aims_is_proved_and_reached(tmp_path: Path) -> None:
+    """Plans lie on the worse side of the front and near it; prices are its slope; both have a hypervolume."""
+    file = tmp_path / "city.toml"
+    write_network(city(), file)
+    for axes in (("circularity", "emissions"), ("cost", "emissions")):
+        front = account_front(file, axes, min_service=0.9, points=4)
+        at_plans = front.at(front.achieved[:, 1])
+        assert (front.sign * (at_plans - front.achieved[:, 0]) >= -1e-5 * abs(at_plans)).all()
+        np.testing.assert_allclose(front.at(front.budgets), front.proved, rtol=1e-4)
+        assert (np.diff(front.prices) <= 1e-6 * front.prices[0]).all() and front.prices[0] > 0
+        assert (front.achieved[:, 1] <= front.budgets * (1 + 1e-4)).all() and (front.levels <= 1).all()
+        proved, achieved = front.volumes
+        assert 0.99 * proved <= achieved <= proved * (1 + 1e-5)
+    out = ["--min-service", "0.9", "--points", "2", "--out", str(tmp_path / "front")]
+    result = CliRunner().invoke(app, ["pareto", str(file), "--between", "cost,emissions", *out])
+    assert result.exit_code == 0, result.output
+    with (tmp_path / "front" / "pareto.csv").open(encoding="utf-8") as lines:
+        assert len(list(csv.reader(lines))) == 3
+    assert (tmp_path / "front" / "pareto.png").stat().st_size > 1000
+    with pytest.raises(CirlError, match="then another account"):
+        account_front(file, ("cost", "circularity"), min_service=0.9)
+    with pytest.raises(CirlError, match="nothing to weigh"):
+        account_front(with_lambda(city()), ("circularity", "moved"), min_service=0.9)

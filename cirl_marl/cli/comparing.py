@@ -131,12 +131,19 @@ def pareto(
         Path | None,
         typer.Option(help="Folder of pareto.csv, .json, .png and the runs; default: runs/pareto-NETWORK[_SCENARIO]."),
     ] = None,
+    between: Annotated[
+        str | None,
+        typer.Option(help="AIM,ACCOUNT: circularity or an account, against an account, at --min-service."),
+    ] = None,
+    min_service: common.MinService = None,
     html: common.Html = None,
 ) -> None:
     """Draw service against circularity: what is possible, what plans achieve, what learners reach.
 
     The bound is swept over the service demanded, the learners over the weight of circularity in their reward, 0 to 1.
     Finished trainings are kept: the same command goes on where it was stopped.
+
+    With --between circularity or an account is held against budgets of another account, such as cost against emissions.
     """
     from cirl_marl.definitions.catalogue import load_network
     from cirl_marl.evaluation.pareto import pareto_front as swept
@@ -145,6 +152,13 @@ def pareto(
     page = common.page_for(html)
     stem = common.stem(load_network(network, scenario=scenario))
     folder = common.folder_for(out or Path("runs") / f"pareto-{stem}", "--out")
+    if between is not None:
+        if recipe is not None or html is not None:
+            raise CirlError("--between goes without --recipe and --html")
+        _between(network, scenario, between, min_service, points, folder)
+        return
+    if min_service is not None:
+        raise CirlError("--min-service goes with --between; without it service is one of the aims")
     options: dict[str, Any] = {"points": points, "seeds": seeds, "steps": steps, "episodes": episodes}
     try:
         with common.shares() as progress:
@@ -162,6 +176,26 @@ def pareto(
     if front.reason:
         common.say(f"no bound: {front.reason}")
     for path in [*write_front(front, folder, recipe=recipe, **options), *common.browser_report(page, front)]:
+        common.say(f"wrote {path}")
+
+
+def _between(
+    network: str, scenario: str | None, axes: str, min_service: float | None, points: int, folder: Path
+) -> None:
+    """Hold an aim against budgets of an account."""
+    from cirl_marl.evaluation.account_front import account_front
+    from cirl_marl.report.account_tables import front_table, write_account_front
+
+    names = [name.strip() for name in axes.split(",")]
+    if len(names) != 2 or min_service is None:
+        raise CirlError(f"--between {axes}: needs AIM,ACCOUNT and --min-service, which both are weighed at")
+    options: dict[str, Any] = {"scenario": scenario, "points": points, "min_service": min_service}
+    with common.shares() as progress:
+        front = account_front(network, (names[0], names[1]), progress=progress, **options)
+    common.console.print(front_table(front))
+    proved, achieved = front.volumes
+    common.say(f"plans dominate {achieved / proved:.1%} of what the proved points do")
+    for path in write_account_front(front, folder, between=axes, **options):
         common.say(f"wrote {path}")
 
 

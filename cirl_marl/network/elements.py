@@ -99,7 +99,8 @@ LEVEL_OF = Kinds("stores", {False: "flow"}, "mass")
 BAND_OF = Kinds("quantity", {"stock": "mass", "measure": "1"}, "flow")
 
 Pair = tuple[float, float]
-AccountRates = tuple[tuple[str, Value], ...]
+AccountRates = Mapping[str, Value] | tuple[tuple[str, Value], ...]
+"""Rates by account; parts keep them as pairs, which can be hashed."""
 
 
 @frozen_record

@@ -1,18 +1,24 @@
-"""What compartments book on accounts in an episode: a table and a picture, by compartment and over time."""
+"""What compartments book on accounts in an episode, and two aims against each other: tables and pictures."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from rich.table import Table
 
 from cirl_marl.controllers.rollout import interval_ends
-from cirl_marl.drawing.style import NEUTRAL, SERIES, WIDTH, save, style_axes
+from cirl_marl.drawing.style import NEUTRAL, SERIES, WIDTH, readable, save, style_axes
+from cirl_marl.evaluation.account_front import AccountFront
+from cirl_marl.evaluation.figures import provenance
 from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.network import Floats
 from cirl_marl.network.calendar import in_years, years
-from cirl_marl.records.files import write_atomically, write_table
+from cirl_marl.network.elements import CIRCULARITY
+from cirl_marl.records.files import publish_folder, write_atomically, write_json, write_table
+from cirl_marl.report.terminal import text_table
 
 SHOWN = len(SERIES)
 """Compartments of an account that the picture shows apart; the others are one."""
@@ -81,3 +87,55 @@ def _by_compartment(simulation: Simulation, account: int) -> list[tuple[str, lis
         entries.setdefault(ledger.compartments[entry], []).append(entry)
     sizes = {id_: abs(float(amounts[:, rows].sum())) for id_, rows in entries.items()}
     return [(id_, entries[id_]) for id_ in sorted(sizes, key=lambda id_: -sizes[id_]) if amounts[:, entries[id_]].any()]
+
+
+def front_table(front: AccountFront) -> Table:
+    """Return budgets, what is proved and planned at each, and what one more of the budget is worth."""
+    (first, second), (unit, other) = front.axes, front.units
+    headings = [
+        f"{second} at most ({other})",
+        f"best {first} ({unit})",
+        f"plan ({unit})",
+        f"worth ({unit} per {other})",
+    ]
+    columns = (front.budgets, front.proved, front.achieved[:, 0], front.prices)
+    rows = [[f"{cell:.5g}" for cell in cells] for cells in zip(*(column.tolist() for column in columns), strict=True)]
+    return text_table(f"{first} against {second}", headings, rows, text=[])
+
+
+def write_account_front(front: AccountFront, folder: Path, **options: Any) -> list[Path]:
+    """Write table, provenance and picture, all of them or none, and return their paths."""
+    (first, second), (unit, other) = front.axes, front.units
+    header = [f"budget of {second} ({other})", f"proved {first} ({unit})", f"worth of one more ({unit}/({other}))"]
+    header += [f"planned {first} ({unit})", f"planned {second} ({other})", "least service level of the plan"]
+    columns = [front.budgets, front.proved, front.prices, *front.achieved.T, front.levels]
+    rows = [list(row) for row in zip(*(column.tolist() for column in columns), strict=True)]
+    proved, achieved = front.volumes
+    about: dict[str, Any] = {"provenance": provenance(front.network, **options), "columns": header, "points": rows}
+    about |= {"as_usual": front.usual.tolist(), "hypervolume": {"proved": proved, "plans": achieved}}
+    names = ("pareto.csv", "pareto.json", "pareto.png")
+    with publish_folder(folder) as draft:
+        write_table(draft / names[0], header, rows)
+        write_json(draft / names[1], about)
+        save_account_front(draft / names[2], front)
+    return [folder / name for name in names]
+
+
+def save_account_front(path: str | Path, front: AccountFront, *, title: str = "") -> Path:
+    """Save two aims against each other as a PNG and return its path; what no episode can reach is shaded."""
+    (first, second), (unit, other), network = front.axes, front.units, front.network
+    figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(*front.achieved.T[::-1], marker="o", color=SERIES[0], label="plan in the simulator")
+    axes.plot(*front.usual[::-1], marker="s", linestyle="", color=SERIES[1], label="as usual")
+    within = np.linspace(front.budgets[0], front.budgets[-1], 200)
+    proved = front.at(within)
+    axes.plot(within, proved, color=NEUTRAL, linewidth=1, label="best possible")
+    low, high = axes.get_ylim()
+    axes.fill_between(within, proved, high if front.sign > 0 else low, color=NEUTRAL, alpha=0.2, linewidth=0)
+    axes.set_ylim(low, high)
+    label = "λ̄" if first == CIRCULARITY else readable(first)
+    style_axes(axes, title=title or f"{network.title or network.name}", ylabel=f"{label} / {unit}")
+    axes.set_xlabel(f"{readable(second)} / {other}", fontsize=9)
+    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8, borderaxespad=0)
+    return save(figure, Path(path))

@@ -1,0 +1,149 @@
+"""Two aims against each other, λ̄ or totals of accounts: what is possible at most, and what plans achieve.
+
+The second is bounded by budgets from what is least possible to what the best of the first takes. Each program proves
+a line that no episode exceeds, v + p·(b − b_k), v its optimum at the budget b_k and p the price of that; the least of
+all lines is the front. Between money and emissions p is the price of carbon, and the front the curve of marginal costs.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cirl_marl.controllers.basic import Neutral
+from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
+from cirl_marl.definitions.catalogue import load_network
+from cirl_marl.environments.vector import MultiAgentVectorEnv
+from cirl_marl.errors import CirlError, whole_number
+from cirl_marl.evaluation.comparison import ProgressReport, part_of
+from cirl_marl.network import Floats, Network
+from cirl_marl.network.declarations import positional_record
+from cirl_marl.network.elements import CIRCULARITY
+from cirl_marl.optimum import bound, improve_plan, simulate_plan
+from cirl_marl.optimum.aims import aims_of
+
+TIGHTEST = 1e-4
+"""Part of the range of budgets by which the first lies above the least that is possible, where solvers still agree."""
+
+
+@positional_record
+class AccountFront:
+    """λ̄, or the total of an account, at each of several budgets of another account; k budgets."""
+
+    network: Network
+    axes: Annotated[tuple[str, str], "what is aimed at, and what has budgets"]
+    min_service: Annotated[Floats, "mean level demanded of each service, shape (services,)"]
+    budgets: Annotated[Floats, "shape (k,), rising"]
+    proved: Annotated[Floats, "best possible of the first, shape (k,)"]
+    prices: Annotated[Floats, "what the first gains by one more of the budget, shape (k,)"]
+    achieved: Annotated[Floats, "what plans come to in the simulator, first and second, shape (k, 2)"]
+    levels: Annotated[Floats, "least mean level of a service under each plan, shape (k,)"]
+    usual: Annotated[Floats, "first and second under neutral control, shape (2,)"]
+
+    @property
+    def sign(self) -> float:
+        """1 if more of the first is better, −1 if less is."""
+        return 1.0 if self.axes[0] == CIRCULARITY else -1.0
+
+    @property
+    def units(self) -> tuple[str, str]:
+        """Those of the two."""
+        units = {account.id: account.unit for account in self.network.accounts}
+        return tuple(units.get(axis, self.network.mass_unit) for axis in self.axes)  # type: ignore[return-value]
+
+    def at(self, budgets: ArrayLike) -> Floats:
+        """Return what is proved of the first at other budgets."""
+        lines = self.sign * self.proved[:, None] + self.prices[:, None] * (np.ravel(budgets) - self.budgets[:, None])
+        return self.sign * np.asarray(lines.min(axis=0))
+
+    @property
+    def volumes(self) -> tuple[float, float]:
+        """Areas that proved points and plans dominate within the nadir of the proved ones: the hypervolumes."""
+        nadir = self.budgets[-1], float(self.sign * self.proved[0])
+        points = (np.stack([self.budgets, self.sign * self.proved]), self.achieved.T[::-1] * [[1.0], [self.sign]])
+        proved, achieved = (_dominated(second, first, *nadir) for second, first in points)
+        return proved, achieved
+
+
+def _dominated(second: Floats, first: Floats, most: float, least: float) -> float:
+    """Return the area below and right of some points, up to ``most`` of the second and down to ``least`` of the first.
+
+    >>> _dominated(np.array([1.0, 2.0]), np.array([1.0, 3.0]), 4.0, 0.0)
+    7.0
+    """
+    order = np.argsort(second)
+    ends = np.append(np.minimum(second[order], most), most)
+    heights = np.maximum.accumulate(np.maximum(first[order] - least, 0.0))
+    return float(np.diff(ends) @ heights)
+
+
+def account_front(
+    network: str | Path | Network,
+    axes: tuple[str, str],
+    *,
+    min_service: ArrayLike,
+    scenario: str | None = None,
+    points: int = 7,
+    progress: ProgressReport = lambda activity, share: None,
+) -> AccountFront:
+    """Hold two aims against each other at a demanded service: λ̄ or an account, and a further account.
+
+    Args:
+        network: catalogue name, definition file, or network, with accounts.
+        axes: ``circularity`` or an account, and an account.
+        min_service: mean level of every service, or of each, shape (services,).
+        scenario: of the definition; None is the default.
+        points: how many budgets, at least 2.
+        progress: as for ``compare``.
+
+    Raises:
+        CirlError: for input that cannot be used, or if both can be had at once, so that there is nothing to weigh.
+        NoCertificate: for a network whose flows are not linear laws.
+    """
+    whole_number("points", points, 2)
+    definition = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
+    first, second = axes
+    if first == second or second == CIRCULARITY:
+        raise CirlError(f"front of {first} and {second}: give '{CIRCULARITY}' or an account, then another account")
+    aims, bounded = aims_of(definition, first, None), aims_of(definition, second, None)
+    assert bounded.account is not None
+    progress("bounds and plans", 0.0)
+    free, least = (
+        bound(definition, aim=first, min_service=min_service),
+        bound(definition, aim=second, min_service=min_service),
+    )
+    range_ = np.array([-least.objective, free.accounts[bounded.account]])
+    width = range_[1] - range_[0]
+    if width <= TIGHTEST * abs(range_[1]):
+        raise CirlError(
+            f"network '{definition.name}': the best {first} takes no more {second} than the least there can be, "
+            f"{range_[0]:.6g} {definition.accounts[bounded.account].unit}, so that there is nothing to weigh"
+        )
+    budgets = np.linspace(range_[0] + TIGHTEST * width, range_[1], points)
+    solved, runs = [], []
+    for place, budget in enumerate(budgets.tolist()):
+        solved.append(bound(definition, aim=first, at_most={second: budget}, min_service=min_service))
+        report = part_of(progress, "bounds and plans", place / points, 1 / points)
+        runs.append(simulate_plan(improve_plan(solved[-1], progress=report)))
+    env = MultiAgentVectorEnv(definition, num_envs=1)
+    origin = episode_start(env)
+    usual = rollout(env, Neutral(), seed=origin.seed, start=origin.initial_state)
+    sign = 1.0 if aims.account is None else -1.0
+
+    def coordinates(run: Rollout) -> list[float]:
+        return [sign * aims.value(run), -bounded.value(run)]
+
+    return AccountFront(
+        network=definition,
+        axes=axes,
+        min_service=np.zeros(0) if free.min_service is None else free.min_service,
+        budgets=budgets,
+        proved=np.array([sign * each.objective for each in solved]),
+        prices=np.array([each.budget_prices[second] for each in solved]),
+        achieved=np.array([coordinates(run) for run in runs]),
+        levels=np.array([float(run.least_service[0]) for run in runs]),
+        usual=np.array(coordinates(usual)),
+    )
