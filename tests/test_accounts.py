@@ -408,11 +408,11 @@ def test_the_front_of_two_aims_is_proved_and_reached(tmp_path: Path) -> None:
         assert (front.achieved[:, 1] <= front.budgets * (1 + 1e-4)).all() and (front.levels <= 1).all()
         proved, achieved = front.volumes
         assert 0.99 * proved <= achieved <= proved * (1 + 1e-5)
-    out = ["--min-service", "0.9", "--points", "2", "--out", str(tmp_path / "front")]
+    out = ["--min-service", "0.9", "--points", "3", "--out", str(tmp_path / "front")]
     result = CliRunner().invoke(app, ["pareto", str(file), "--between", "cost,emissions", *out])
     assert result.exit_code == 0, result.output
     with (tmp_path / "front" / "pareto.csv").open(encoding="utf-8") as lines:
-        assert len(list(csv.reader(lines))) == 3
+        assert len(list(csv.reader(lines))) == 4
     assert (tmp_path / "front" / "pareto.png").stat().st_size > 1000
     with pytest.raises(CirlError, match="then another account"):
         account_front(file, ("cost", "circularity"), min_service=0.9)

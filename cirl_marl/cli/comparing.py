@@ -194,7 +194,8 @@ def _between(
         front = account_front(network, (names[0], names[1]), progress=progress, **options)
     common.console.print(front_table(front))
     proved, achieved = front.volumes
-    common.say(f"plans dominate {achieved / proved:.1%} of what the proved points do")
+    if proved > 0:
+        common.say(f"plans dominate {achieved / proved:.1%} of what the proved points do")
     for path in write_account_front(front, folder, between=axes, **options):
         common.say(f"wrote {path}")
 

@@ -64,14 +64,14 @@ class AccountFront:
         """Areas that proved points and plans dominate within the nadir of the proved ones: the hypervolumes."""
         nadir = self.budgets[-1], float(self.sign * self.proved[0])
         points = (np.stack([self.budgets, self.sign * self.proved]), self.achieved.T[::-1] * [[1.0], [self.sign]])
-        proved, achieved = (_dominated(second, first, *nadir) for second, first in points)
+        proved, achieved = (area_dominated(second, first, *nadir) for second, first in points)
         return proved, achieved
 
 
-def _dominated(second: Floats, first: Floats, most: float, least: float) -> float:
+def area_dominated(second: Floats, first: Floats, most: float, least: float) -> float:
     """Return the area below and right of some points, up to ``most`` of the second and down to ``least`` of the first.
 
-    >>> _dominated(np.array([1.0, 2.0]), np.array([1.0, 3.0]), 4.0, 0.0)
+    >>> area_dominated(np.array([1.0, 2.0]), np.array([1.0, 3.0]), 4.0, 0.0)
     7.0
     """
     order = np.argsort(second)
@@ -96,14 +96,14 @@ def account_front(
         axes: ``circularity`` or an account, and an account.
         min_service: mean level of every service, or of each, shape (services,).
         scenario: of the definition; None is the default.
-        points: how many budgets, at least 2.
+        points: how many budgets, at least 3.
         progress: as for ``compare``.
 
     Raises:
         CirlError: for input that cannot be used, or if both can be had at once, so that there is nothing to weigh.
         NoCertificate: for a network whose flows are not linear laws.
     """
-    whole_number("points", points, 2)
+    whole_number("points", points, 3)
     definition = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
     first, second = axes
     if first == second or second == CIRCULARITY:
@@ -111,10 +111,7 @@ def account_front(
     aims, bounded = aims_of(definition, first, None), aims_of(definition, second, None)
     assert bounded.account is not None
     progress("bounds and plans", 0.0)
-    free, least = (
-        bound(definition, aim=first, min_service=min_service),
-        bound(definition, aim=second, min_service=min_service),
-    )
+    free, least = (bound(definition, aim=aim, min_service=min_service) for aim in axes)
     range_ = np.array([-least.objective, free.accounts[bounded.account]])
     width = range_[1] - range_[0]
     if width <= TIGHTEST * abs(range_[1]):

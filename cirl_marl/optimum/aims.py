@@ -40,7 +40,7 @@ class Aims:
         """The budgets, shape (budgets,)."""
         return np.array([*self.budgets.values()], dtype=np.float64)
 
-    def tightened(self, excess: Floats) -> Aims:
+    def with_lower_budgets(self, excess: Floats) -> Aims:
         """Return the aims with budgets that are lower by ``excess``, shape (budgets,)."""
         return Aims(self.account, dict(zip(self.budgets, (self.limits - excess).tolist(), strict=True)))
 

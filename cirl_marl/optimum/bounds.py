@@ -413,7 +413,7 @@ def _unreachable(problem: Program, min_service: Floats | None, aims: Aims) -> st
             if excess > 0
         ]
         return f"network '{network.name}': no actions keep the budget of {', '.join(least)}"
-    return _unserved(problem, min_service)
+    return _unreached_services(problem, min_service)
 
 
 def _without_rows(problem: Program, rows: Sequence[int]) -> Program:
@@ -430,7 +430,7 @@ def _least_excess(problem: Program, row: int, without: Sequence[int]) -> float:
     return excess if excess > FEASIBLE * size else 0.0
 
 
-def _unserved(problem: Program, min_service: Floats | None) -> str:
+def _unreached_services(problem: Program, min_service: Floats | None) -> str:
     """Say what is wrong with a program without solution: the services out of reach, with the highest level of each."""
     network = problem.layout.network
     if min_service is None or not network.services:

@@ -185,7 +185,7 @@ def refine(
             demand_ranges, REFINEMENT_DEGREE, bound.service_weight, hold_controls=True, system=bound.problem.system
         )
         try:
-            aims = bound.aims.tightened(excess)
+            aims = bound.aims.with_lower_budgets(excess)
             problem = programs.program(bound.initial, bound.min_service, aims=aims)
             variables = solve(problem, label="the program of a better plan", certify=False).plan
         except (Infeasible, SolverFailure):  # more than can be had: what was found so far is the plan
