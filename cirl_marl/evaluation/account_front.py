@@ -1,8 +1,9 @@
 """Two aims against each other, λ̄ or totals of accounts: what is possible at most, and what plans achieve.
 
-The second is bounded by budgets from what is least possible to what the best of the first takes. Each program proves
-a line that no episode exceeds, v + p·(b − b_k), v its optimum at the budget b_k and p the price of that; the least of
-all lines is the front. Between money and emissions p is the price of carbon, and the front the curve of marginal costs.
+The second is bounded by budgets from what the plan with least of it takes to what the best of the first takes. Each
+program proves a line that no episode exceeds, v + p·(b − b_k), v its optimum at the budget b_k and p the price of that;
+the least of all lines is the front. Between money and emissions p is the price of carbon, and the front the curve of
+marginal costs.
 """
 
 from __future__ import annotations
@@ -24,9 +25,12 @@ from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import CIRCULARITY
 from cirl_marl.optimum import bound, improve_plan, simulate_plan
 from cirl_marl.optimum.aims import aims_of
+from cirl_marl.optimum.improve import shortage
 
 TIGHTEST = 1e-4
-"""Part of the range of budgets by which the first lies above the least that is possible, where solvers still agree."""
+"""Range of budgets, relative to the highest, below which there is nothing to weigh."""
+SERVED = 1e-3
+"""What a plan may lack of a service, or exceed its budget by relative to that, and count."""
 
 
 @positional_record
@@ -41,6 +45,7 @@ class AccountFront:
     prices: Annotated[Floats, "what the first gains by one more of the budget, shape (k,)"]
     achieved: Annotated[Floats, "what plans come to in the simulator, first and second, shape (k, 2)"]
     levels: Annotated[Floats, "least mean level of a service under each plan, shape (k,)"]
+    shortages: Annotated[Floats, "most that a plan is short of a service or exceeds its budget, relative, shape (k,)"]
     usual: Annotated[Floats, "first and second under neutral control, shape (2,)"]
 
     @property
@@ -61,9 +66,13 @@ class AccountFront:
 
     @property
     def volumes(self) -> tuple[float, float]:
-        """Areas that proved points and plans dominate within the nadir of the proved ones: the hypervolumes."""
+        """Areas that proved points and plans dominate within the nadir of the proved ones: the hypervolumes.
+
+        Plans that are short of what is demanded do not count.
+        """
         nadir = self.budgets[-1], float(self.sign * self.proved[0])
-        points = (np.stack([self.budgets, self.sign * self.proved]), self.achieved.T[::-1] * [[1.0], [self.sign]])
+        kept = self.achieved[self.shortages <= SERVED]
+        points = (np.stack([self.budgets, self.sign * self.proved]), kept.T[::-1] * [[1.0], [self.sign]])
         proved, achieved = (area_dominated(second, first, *nadir) for second, first in points)
         return proved, achieved
 
@@ -112,14 +121,14 @@ def account_front(
     assert bounded.account is not None
     progress("bounds and plans", 0.0)
     free, least = (bound(definition, aim=aim, min_service=min_service) for aim in axes)
-    range_ = np.array([-least.objective, free.accounts[bounded.account]])
-    width = range_[1] - range_[0]
-    if width <= TIGHTEST * abs(range_[1]):
+    lowest = simulate_plan(improve_plan(least)).accounts[0, bounded.account]
+    highest = free.accounts[bounded.account]
+    if highest - lowest <= TIGHTEST * abs(highest):
         raise CirlError(
-            f"network '{definition.name}': the best {first} takes no more {second} than the least there can be, "
-            f"{range_[0]:.6g} {definition.accounts[bounded.account].unit}, so that there is nothing to weigh"
+            f"network '{definition.name}': the best {first} takes no more {second} than the least that a plan does, "
+            f"{lowest:.6g} {definition.accounts[bounded.account].unit}, so that there is nothing to weigh"
         )
-    budgets = np.linspace(range_[0] + TIGHTEST * width, range_[1], points)
+    budgets = np.linspace(lowest, highest, points)
     solved, runs = [], []
     for place, budget in enumerate(budgets.tolist()):
         solved.append(bound(definition, aim=first, at_most={second: budget}, min_service=min_service))
@@ -142,5 +151,6 @@ def account_front(
         prices=np.array([each.budget_prices[second] for each in solved]),
         achieved=np.array([coordinates(run) for run in runs]),
         levels=np.array([float(run.least_service[0]) for run in runs]),
+        shortages=np.array([shortage(each, run) for each, run in zip(solved, runs, strict=True)]),
         usual=np.array(coordinates(usual)),
     )
