@@ -34,11 +34,11 @@ from cirl_marl import (
     write_network,
 )
 from cirl_marl.cli import app
-from cirl_marl.controllers import Random
+from cirl_marl.controllers import Neutral, Random
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.dynamics.ledger import Ledger
 from cirl_marl.network.disturbances import DisturbanceEffect, Markov
-from cirl_marl.network.uncertainty import Spread
+from cirl_marl.network.uncertainty import Spread, network_of_intervals
 from cirl_marl.network.units import factor
 from cirl_marl.optimum import bound, improve, improve_plan, simulate_plan, smooth_plan
 
@@ -419,3 +419,43 @@ def test_the_front_of_two_aims_is_proved_and_reached(tmp_path: Path) -> None:
         account_front(file, ("cost", "circularity"), min_service=0.9)
     with pytest.raises(CirlError, match="nothing to weigh"):
         account_front(with_lambda(load_network("paper_city")), ("circularity", "moved"), min_service=0.9)
+
+
+@pytest.mark.parametrize(
+    ("name", "least", "most"), [("steel_world", 3300.0, 3800.0), ("aluminium_world", 900.0, 1150.0)]
+)
+def test_emissions_of_the_first_year_are_near_those_reported(name: str, least: float, most: float) -> None:
+    """worldsteel: 1.91 t CO2 a tonne of 1.89 Gt of steel; International Aluminium Institute: 1.11 Gt with rolling."""
+    run = rollout(MultiAgentVectorEnv(name, num_envs=1, horizon=1), Neutral())
+    assert least <= float(run.booked[0, 0, 0]) <= most
+
+
+def test_copies_and_intervals_keep_what_is_booked() -> None:
+    """Regions share accounts, each compartment of a copy its rates; a network of other intervals has their rates."""
+    world = load_network("steel_world")
+    assert [account.id for account in world.accounts] == ["emissions"]
+    assert dict(world.compartments["japan_pig_iron_made"].accounts) == {"emissions": pytest.approx(0.00259)}
+    network = booked(random_network(5, 6, 12), 5)
+    steps = network.episode.horizon
+    backwards = network_of_intervals(network, np.arange(steps)[::-1])
+    undiscounted = [
+        replace(each, accounts=tuple(replace(a, discount=0.0) for a in ACCOUNTS)) for each in (network, backwards)
+    ]
+    for rates, others in zip(*(Ledger(each).rates() for each in undiscounted), strict=True):
+        np.testing.assert_allclose(rates[:, ::-1], others)
+    assert any(isinstance(rate, Series) for arc in network.arcs for rate in dict(arc.accounts).values())
+
+
+def test_multipliers_of_a_budget_hold_at_other_starts() -> None:
+    """``Bound.at`` takes the aim and the budgets along: it proves no less than a program of that start."""
+    network = city()
+    least = -bound(network, aim="emissions", min_service=0.9).objective
+    solved = bound(network, min_service=0.9, at_most={"emissions": 1.5 * least})
+    for aim, found in (("circularity", solved), ("cost", bound(network, aim="cost", min_service=0.9))):
+        start = found.initial * np.array([1.0, 1.1, 0.9, 1.2, 1.0])
+        own = bound(
+            network, start, aim=aim, min_service=0.9, at_most={"emissions": 1.5 * least} if found is solved else None
+        )
+        proved = float(found.at(start))
+        assert own.objective - 1e-6 * abs(own.objective) <= proved <= own.objective + 0.2 * abs(own.objective)
+        assert float(found.at()) == pytest.approx(found.objective, rel=1e-9)
