@@ -453,9 +453,8 @@ def test_multipliers_of_a_budget_hold_at_other_starts() -> None:
     solved = bound(network, min_service=0.9, at_most={"emissions": 1.5 * least})
     for aim, found in (("circularity", solved), ("cost", bound(network, aim="cost", min_service=0.9))):
         start = found.initial * np.array([1.0, 1.1, 0.9, 1.2, 1.0])
-        own = bound(
-            network, start, aim=aim, min_service=0.9, at_most={"emissions": 1.5 * least} if found is solved else None
-        )
+        budgets = {"emissions": 1.5 * least} if found is solved else None
+        own = bound(network, start, aim=aim, min_service=0.9, at_most=budgets)
         proved = float(found.at(start))
         assert own.objective - 1e-6 * abs(own.objective) <= proved <= own.objective + 0.2 * abs(own.objective)
         assert float(found.at()) == pytest.approx(found.objective, rel=1e-9)
