@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from cirl_marl.environments.goal import GoalEnv as GoalEnv
     from cirl_marl.environments.joint import JointEnv as JointEnv
     from cirl_marl.environments.joint import JointVectorEnv as JointVectorEnv
+    from cirl_marl.environments.multi_objective import MOParallelEnv as MOParallelEnv
+    from cirl_marl.environments.multi_objective import mo_parallel_env as mo_parallel_env
     from cirl_marl.environments.parallel import NetworkParallelEnv as NetworkParallelEnv
     from cirl_marl.environments.parallel import aec_env as aec_env
     from cirl_marl.environments.parallel import parallel_env as parallel_env
@@ -132,6 +134,7 @@ _MODULES = {
     "environments.derivatives": "gradient",
     "environments.goal": "GoalEnv",
     "environments.joint": "JointEnv JointVectorEnv",
+    "environments.multi_objective": "MOParallelEnv mo_parallel_env",
     "environments.parallel": "NetworkParallelEnv aec_env parallel_env vector_env",
     "environments.registration": "register",
     "environments.single": "SingleAgentEnv single_agent_env",

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cirl_marl import (
+    Account,
     Arc,
     Control,
     ControlKind,
@@ -62,6 +63,28 @@ def small(
             solver_step=None if solver == "exact" else interval,
         ),
     )
+
+
+ACCOUNTS = (Account(id="cost", unit="EUR_2023", discount=0.04), Account(id="emissions", unit="t CO2e"))
+
+
+def booked(network: Network, seed: int, *, credits: bool = True) -> Network:
+    """Return a network whose compartments book random amounts, some of which change in time."""
+    rng = np.random.default_rng([seed, 7])
+    length = network.episode.control_interval * network.episode.horizon
+
+    def rates() -> dict[str, float | Series]:
+        chosen: dict[str, float | Series] = {}
+        for account in ("cost", "emissions"):
+            value = float(rng.normal() if credits else abs(rng.normal()))
+            if rng.random() < 0.6:
+                step = Series(times=(0.0, length / 3), values=(value, 2 * value))
+                chosen[account] = step if rng.random() < 0.3 else value
+        return chosen
+
+    nodes = tuple(replace(n, accounts=rates(), holding=rates() if n.stores else {}) for n in network.nodes)
+    arcs = tuple(replace(a, accounts=rates()) for a in network.arcs)
+    return replace(network, nodes=nodes, arcs=arcs, accounts=ACCOUNTS, scenarios={})
 
 
 NO_STATES = np.empty((0, 1))

@@ -12,7 +12,7 @@ import pytest
 from conftest import random_network
 from hypothesis import given
 from hypothesis import strategies as st
-from small_networks import plain_networks, small
+from small_networks import ACCOUNTS, booked, plain_networks, small
 from test_optimum import bounded, certifiable, pinned
 from typer.testing import CliRunner
 
@@ -29,6 +29,7 @@ from cirl_marl import (
     Series,
     account_front,
     load_network,
+    mo_parallel_env,
     parallel_env,
     plan,
     write_network,
@@ -41,27 +42,6 @@ from cirl_marl.network.disturbances import DisturbanceEffect, Markov
 from cirl_marl.network.uncertainty import Spread, network_of_intervals
 from cirl_marl.network.units import factor
 from cirl_marl.optimum import bound, improve, improve_plan, simulate_plan, smooth_plan
-
-ACCOUNTS = (Account(id="cost", unit="EUR_2023", discount=0.04), Account(id="emissions", unit="t CO2e"))
-
-
-def booked(network: Network, seed: int, *, credits: bool = True) -> Network:
-    """Return a network whose compartments book random amounts, some of which change in time."""
-    rng = np.random.default_rng([seed, 7])
-    length = network.episode.control_interval * network.episode.horizon
-
-    def rates() -> dict[str, float | Series]:
-        chosen: dict[str, float | Series] = {}
-        for account in ("cost", "emissions"):
-            value = float(rng.normal() if credits else abs(rng.normal()))
-            if rng.random() < 0.6:
-                step = Series(times=(0.0, length / 3), values=(value, 2 * value))
-                chosen[account] = step if rng.random() < 0.3 else value
-        return chosen
-
-    nodes = tuple(replace(n, accounts=rates(), holding=rates() if n.stores else {}) for n in network.nodes)
-    arcs = tuple(replace(a, accounts=rates()) for a in network.arcs)
-    return replace(network, nodes=nodes, arcs=arcs, accounts=ACCOUNTS, scenarios={})
 
 
 def with_lambda(network: Network) -> Network:
@@ -165,6 +145,23 @@ def test_infos_hold_what_each_interval_and_the_episode_book() -> None:
     final = next(iter(infos.values()))["final_info"]
     assert final["episode_emissions"].shape == final["episode_cost"].shape == (2,)
     assert (final["episode_emissions"] > 0).all() and (sums > 0).all()
+
+
+def test_vector_rewards_add_up_to_what_is_reported() -> None:
+    """λ̄, levels and totals of an episode, each by itself, and the same for all; a finished episode pays nothing."""
+    env = mo_parallel_env(city(), horizon=4)
+    assert env.reward_names == ("circularity", "paper_delivered", "cost", "emissions")
+    env.reset(seed=2)
+    rewards = []
+    while env.agents:
+        paid = env.step(env.neutral_action)[1]
+        assert {reward.tobytes() for reward in paid.values()} == {paid["feed"].tobytes()}
+        assert all(env.reward_space(agent).contains(reward) for agent, reward in paid.items())
+        rewards.append(paid["feed"])
+    state = env.batch.physical
+    expected = np.concatenate([state.circularity, state.service[:, 0], -state.accounts[:, 0]])
+    np.testing.assert_allclose(np.sum(rewards, axis=0), expected, rtol=1e-5)
+    assert len(rewards) == 4 and env.step({})[1] == {}
 
 
 @given(network=plain_networks)

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from small_networks import KINDS, cycle
+from small_networks import KINDS, booked, cycle
 
 import cirl_marl
-from cirl_marl import ControlError, DifferentiableEnv
+from cirl_marl import ControlError, DifferentiableEnv, load_network
 from cirl_marl.network.disturbances import DisturbanceEffect
 
 NETWORK = replace(
@@ -75,3 +75,21 @@ def test_steps_need_a_start() -> None:
     """And say so."""
     with pytest.raises(ControlError, match="call reset"):
         DifferentiableEnv(NETWORK, num_envs=1).step(torch.zeros(1, 1))
+
+
+def test_gradients_of_what_is_booked() -> None:
+    """Amounts on accounts can be climbed down too, those that a policy's actions book later included."""
+    network = booked(load_network("paper_city").with_options(episode={"horizon": 4}), 3)
+    env = DifferentiableEnv(network, num_envs=2)
+    env.reset(1)
+    entries = len(env.env.actuators.control_rows)
+    schedule = torch.tensor(np.random.default_rng(0).uniform(-0.5, 0.5, (4, entries, 2)), requires_grad=True)
+    exact = cirl_marl.gradient(env.env, schedule.detach().numpy(), circularity=0.0, accounts=[2.0, -1.0])
+    totals = torch.zeros(2, 2, dtype=torch.float64)
+    for actions in schedule:
+        env.step(actions)
+        totals = totals + env.booked
+    np.testing.assert_allclose(totals.detach().numpy(), exact.accounts, rtol=1e-12)
+    (2.0 * totals[0] - totals[1]).sum().backward()  # type: ignore[no-untyped-call]
+    assert schedule.grad is not None and np.abs(exact.actions).max() > 0
+    np.testing.assert_allclose(schedule.grad.numpy(), exact.actions, rtol=1e-12, atol=1e-12)

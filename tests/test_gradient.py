@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from small_networks import KINDS, cycle, disturbed_networks, small
+from small_networks import KINDS, booked, cycle, disturbed_networks, small
 
 import cirl_marl
 from cirl_marl import Arc, CirlError, ControlError, Law, MultiAgentVectorEnv, Network, load_network
@@ -50,8 +50,9 @@ def check(env: MultiAgentVectorEnv, seed: int, monkeypatch: pytest.MonkeyPatch) 
     entries, services = len(env.actuators.control_rows), len(env.network.services)
     actions = rng.uniform(-0.9, 0.9, (horizon, entries, batch))
     circularity, levels = rng.normal(), rng.normal(size=services) * 30
+    accounts = rng.normal(size=len(env.network.accounts)) / horizon
     state, controls = env.physical, env.controls
-    exact_gradient = cirl_marl.gradient(env, actions, circularity=circularity, levels=levels)
+    exact_gradient = cirl_marl.gradient(env, actions, circularity=circularity, levels=levels, accounts=accounts)
     assert env.physical is state
 
     def value(start: State, schedule: np.ndarray) -> np.ndarray:
@@ -59,10 +60,11 @@ def check(env: MultiAgentVectorEnv, seed: int, monkeypatch: pytest.MonkeyPatch) 
         for action in schedule:
             env.advance(action)
         total, mean = env.physical, horizon
-        return circularity * total.circularity / mean + levels @ (total.service / mean)
+        value: np.ndarray = circularity * total.circularity / mean + levels @ (total.service / mean)
+        return value + accounts @ total.accounts
 
     np.testing.assert_allclose(
-        circularity * exact_gradient.circularity + levels @ exact_gradient.levels,
+        circularity * exact_gradient.circularity + levels @ exact_gradient.levels + accounts @ exact_gradient.accounts,
         value(state, actions),
         rtol=1e-12,
         atol=1e-12,
@@ -101,7 +103,7 @@ def check(env: MultiAgentVectorEnv, seed: int, monkeypatch: pytest.MonkeyPatch) 
 @given(network=st.from_type(Network) | disturbed_networks(), seed=st.integers(0, 1000))
 def test_random_networks(network: Network, seed: int) -> None:
     """With lifetimes, shares, loops, series, scheduled flows, bands and disturbances, in many substeps and copies."""
-    network = differentiable(network)
+    network = differentiable(booked(network, seed) if seed % 2 else network)
     assume(network.agents)
     with pytest.MonkeyPatch.context() as monkeypatch:
         env = MultiAgentVectorEnv(network, num_envs=2, uncertain=bool(network.uncertain))

@@ -39,8 +39,10 @@ class DifferentiableEnv:
         env: the environment.
         start: masses at the start of the episode, shape (masses, B), a leaf whose ``grad`` is filled.
         disturbances: their values, shape (intervals, names, B), likewise.
+        booked: discounted amounts that the last interval booked on accounts, shape (accounts, B).
     """
 
+    booked: Tensor
     start: Tensor
     disturbances: Tensor
 
@@ -79,18 +81,18 @@ class DifferentiableEnv:
         if self._stock is None:
             raise ControlError("the environment has no state yet: call reset() first")
         outputs: Any = _Interval.apply(self._derivatives, self._stock, actions, self.disturbances)  # type: ignore[no-untyped-call]
-        self._stock, circularity, levels, observation = outputs
+        self._stock, circularity, levels, observation, self.booked = outputs
         return observation, circularity, levels
 
 
 class _Interval(torch.autograd.Function):
-    """(x, a, ξ) → (x', λ, levels, observation), by the kernels of the simulator."""
+    """(x, a, ξ) → (x', λ, levels, observation, accounts), by the kernels of the simulator."""
 
     @staticmethod
     def forward(ctx: Any, derivatives: Derivatives, stock: Tensor, actions: Tensor, paths: Tensor) -> Any:
         ctx.derivatives, ctx.dtype = derivatives, actions.dtype
         ctx.interval, outputs = derivatives.advance(actions.detach().cpu().double().numpy())
-        parts = (outputs.stock, outputs.circularity, outputs.levels, outputs.observation)
+        parts = (outputs.stock, outputs.circularity, outputs.levels, outputs.observation, outputs.accounts)
         return tuple(torch.tensor(part) for part in parts)
 
     @staticmethod

@@ -76,10 +76,34 @@ class Ledger:
             step: the interval, shape (B,).
             factors: those on numbers that are not certain, shape (numbers, B).
         """
-        rates = self._rates if self._rates.shape[1] == 1 else self._rates.take(step, axis=1)
-        rates = self._factors(rates, factors)
+        rates = self._factors(self._rates_in(step), factors)
         amounts: Floats = self._charged(np.concatenate([flow, (before + after) / 2])) * rates * self._interval
         return amounts
+
+    def _rates_in(self, step: Integers) -> Floats:
+        """Return the rate of each entry in the interval ``step`` of each copy, as it is stated."""
+        return self._rates if self._rates.shape[1] == 1 else self._rates.take(step, axis=1)
+
+    def pull_back(
+        self,
+        adjoint: Floats,
+        flow: Floats,
+        held: Floats,
+        step: Integers,
+        factors: Floats | None,
+        factor_adjoint: Floats | None,
+    ) -> tuple[Floats, Floats]:
+        """Return derivatives by mean flows and by mean stocks ``held`` of those by discounted amounts, (accounts, B).
+
+        Those by the factors on rates are added to ``factor_adjoint``.
+        """
+        stated = self._rates_in(step)
+        per_entry = (adjoint * self.discount.take(step, axis=1)).take(self.account, axis=0) * self._interval
+        if factors is not None and factor_adjoint is not None:
+            table = np.broadcast_to(stated, per_entry.shape) * self._charged(np.concatenate([flow, held]))
+            self._factors.pull_back(table, per_entry, factor_adjoint)
+        by_charged = self._charged.transpose()(per_entry * self._factors(stated, factors))
+        return by_charged[: len(flow)], by_charged[len(flow) :]
 
     def sums(self, entries: Floats) -> Floats:
         """Return the amount on each account, shape (accounts, B), of those of entries."""

@@ -26,14 +26,18 @@ class Outputs:
     observation: Annotated[
         Floats | None, "stacked observation in double precision, shape (entries of all agents, B); None: nobody looks"
     ] = None
+    accounts: Annotated[Floats | None, "discounted amounts on accounts, shape (accounts, B); None: nobody counts"] = (
+        None
+    )
 
 
 @positional_record
 class Gradient:
-    """What open-loop actions do, and the derivatives of c·λ̄ + Σ_s w_s·l_s, in each copy."""
+    """What open-loop actions do, and the derivatives of c·λ̄ + Σ_s w_s·l_s + Σ_a v_a·A_a, in each copy."""
 
     circularity: Annotated[Floats, "λ̄, mean of λ over the intervals, shape (B,), mass"]
     levels: Annotated[Floats, "l, mean level of each service, shape (services, B)"]
+    accounts: Annotated[Floats, "A, discounted total on each account, shape (accounts, B)"]
     actions: Annotated[Floats, "by the actions, shape (intervals, entries, B)"]
     start: Annotated[Floats, "by the stocks at the start, those with a lifetime by stage, shape (stocks, B), 1/mass"]
     disturbances: Annotated[Floats, "by the values of the disturbances, shape (intervals, names, B)"]
@@ -55,8 +59,9 @@ class Derivatives:
     def advance(self, actions: Floats) -> tuple[Interval, Outputs]:
         """Hold stacked actions, shape (entries, B), for an interval, as ``MultiAgentVectorEnv.advance`` does."""
         env, outcome = self.env, self.env.advance(actions)
-        outputs = Outputs(env.physical.stock, outcome.circularity_mean, outcome.levels, self.observation())
-        return env.interval, outputs
+        booked = env.interval.after.accounts - env.interval.before.accounts
+        seen = self.observation()
+        return env.interval, Outputs(env.physical.stock, outcome.circularity_mean, outcome.levels, seen, booked)
 
     def observation(self) -> Floats:
         """Return the present stacked observation in double precision, shape (entries of all agents, B)."""
@@ -82,7 +87,14 @@ class Derivatives:
             by_quantity += by_seen
         by_flow = by_quantity[signals.flows] + network.circularity_adjoint(after.flow) * adjoint.circularity
         by_flow += network.throughput_adjoint(by_quantity[signals.throughputs])
-        stock = adjoint.stock + env.rows.masses_adjoint(by_quantity[signals.stocks])
+        by_stock, by_start = by_quantity[signals.stocks], None
+        if adjoint.accounts is not None and env.ledger.accounts:
+            held = (env.rows.stocks(before.stock) + env.rows.stocks(after.stock)) / 2
+            booked = env.ledger.pull_back(adjoint.accounts, after.flow, held, step, factors, factor_adjoint)
+            by_flow += booked[0]
+            by_start = booked[1] / 2
+            by_stock = by_stock + by_start
+        stock = adjoint.stock + env.rows.masses_adjoint(by_stock)
         inputs = IntervalInputs(before.stock, interval.controls, factors)
         moved = by_flow / network.episode.control_interval
         result = self._supply.pull_back(inputs, step, env.idle, stock, moved)
@@ -94,9 +106,12 @@ class Derivatives:
             draws = env.dynamics.factors.pull_back(
                 before.factors, before.disturbances, step, factor_adjoint, path_adjoint
             )
-        return result.stock, actions, draws
+        start = result.stock if by_start is None else result.stock + env.rows.masses_adjoint(by_start)
+        return start, actions, draws
 
-    def open_loop(self, actions: Floats, circularity: ArrayLike = 1.0, levels: ArrayLike = 0.0) -> Gradient:
+    def open_loop(
+        self, actions: Floats, circularity: ArrayLike = 1.0, levels: ArrayLike = 0.0, accounts: ArrayLike = 0.0
+    ) -> Gradient:
         """Return ``gradient`` of actions that have its shape."""
         env, (steps, _, batch) = self.env, actions.shape
         state, controls, services = env.physical, env.controls, len(env.network.services)
@@ -105,40 +120,54 @@ class Derivatives:
         finally:
             env.go_back(state, controls)
         by_circularity = np.broadcast_to(np.asarray(circularity, dtype=float), (batch,)) / steps
-        weights = np.asarray(levels, dtype=float)
-        by_level = np.broadcast_to(weights if weights.ndim == 2 else weights.reshape(-1, 1), (services, batch)) / steps
+        by_level = _columns(levels, (services, batch)) / steps
+        by_account = _columns(accounts, (len(env.ledger.accounts), batch))
         stock, draws = np.zeros_like(state.stock), np.zeros_like(state.factors)
         paths, by_action = np.zeros_like(state.disturbances), np.empty(actions.shape)
         for t in reversed(range(steps)):
-            outputs = Outputs(stock, by_circularity, by_level)
+            outputs = Outputs(stock, by_circularity, by_level, accounts=by_account)
             stock, by_action[t], drawn = self.pull_back(tape[t][1], outputs, paths)
             draws += drawn
         mean_circularity = np.mean([outcome.circularity_mean for outcome, _ in tape], axis=0)
         mean_levels = np.mean([outcome.levels for outcome, _ in tape], axis=0)
-        return Gradient(mean_circularity, mean_levels, by_action, stock[env.rows.nodes], paths, draws)
+        totals = tape[-1][1].after.accounts - state.accounts
+        return Gradient(mean_circularity, mean_levels, totals, by_action, stock[env.rows.nodes], paths, draws)
+
+
+def _columns(weights: ArrayLike, shape: tuple[int, int]) -> Floats:
+    """Return weights, a number, one for each row or of this shape, in it."""
+    array = np.asarray(weights, dtype=float)
+    return np.broadcast_to(array if array.ndim == 2 else array.reshape(-1, 1), shape)
 
 
 def gradient(
-    env: MultiAgentVectorEnv, actions: ArrayLike, *, circularity: ArrayLike = 1.0, levels: ArrayLike = 0.0
+    env: MultiAgentVectorEnv,
+    actions: ArrayLike,
+    *,
+    circularity: ArrayLike = 1.0,
+    levels: ArrayLike = 0.0,
+    accounts: ArrayLike = 0.0,
 ) -> Gradient:
-    """Return what open-loop actions do from here, and exact derivatives of c·λ̄ + Σ_s w_s·l_s, copy by copy.
+    """Return what open-loop actions do from here, and exact derivatives of c·λ̄ + Σ_s w_s·l_s + Σ_a v_a·A_a.
 
-    λ̄ and l_s are means over the intervals. The environment stays where it is. Derivatives are those of the simulator:
-    cuts of flows, clips and supplies that make up for services are in them. At a kink they are one-sided: of a flow as
-    if it were not cut, of a level as within its band, of an action from within its bounds.
+    λ̄ and l_s are means over the intervals, A_a totals on accounts; every copy is by itself. The environment stays where
+    it is. Derivatives are those of the simulator: cuts of flows, clips and supplies that make up for services are in
+    them. At a kink they are one-sided: of a flow as if it were not cut, of a level as within its band, of an action
+    from within its bounds.
 
     Args:
         env: after ``reset``.
         actions: stacked actions, shape (intervals, entries, num_envs), or without the last axis.
         circularity: c, a number or shape (num_envs,).
         levels: w, a number, shape (services,) or (services, num_envs).
+        accounts: v, likewise, of accounts.
 
     Raises:
         CirlError: for what has no derivative: compartments with models, batches, other solvers than ``exact``, and
             stocks that recipients empty; names the network, the compartment and the reason.
         ControlError: for actions of another shape or out of bounds.
     """
-    return Derivatives(env).open_loop(stacked_schedule(env, actions), circularity, levels)
+    return Derivatives(env).open_loop(stacked_schedule(env, actions), circularity, levels, accounts)
 
 
 def stacked_schedule(env: MultiAgentVectorEnv, actions: ArrayLike) -> Floats:

@@ -225,8 +225,10 @@ class NetworkWorld(World):
             RunError: if it holds something else than the arrays of this environment.
         """
         physical = state.get("state") if isinstance(state, Mapping) else None
-        if isinstance(physical, Mapping):  # older ones say nothing of disturbances, of which there were none
-            state = {**state, "state": {"processes": no_paths(), "disturbances": no_paths(), **physical}}
+        if isinstance(physical, Mapping):  # older ones say nothing of disturbances and accounts, which there were not
+            accounts = np.zeros((len(self.env.network.accounts), self.env.num_envs))
+            missing = {"processes": no_paths(), "disturbances": no_paths(), "accounts": accounts}
+            state = {**state, "state": {**missing, **physical}}
         require_alike(state, self.state_dict(), "the state of the environment")
         streams = tuple(state["streams"])
         self.env.restore(Snapshot(State(**state["state"]), streams, self.env.agents, self.env.network))

@@ -98,7 +98,8 @@ class GradientStack(Stack):
     def _play(self) -> None:
         """Play an episode in every copy, and keep what the way back needs."""
         self._tape: list[tuple[Interval, list[Tensor], NDArray[np.floating]]] = []
-        before, is_over = State(**self._models[0].episode_start), False
+        accounts = np.zeros_like(self._env.physical.accounts)  # of which runs of old say nothing
+        before, is_over = State(**{"accounts": accounts, **self._models[0].episode_start}), False
         while not is_over:
             values = self._weights.actor.forward(self._current[..., : self._inputs.local])
             slopes, replays = self._inputs.slopes, bool(self.members[0].barrier.replay_log)
