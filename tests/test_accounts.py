@@ -85,7 +85,7 @@ def test_what_decays_books_what_left_and_what_was_held() -> None:
     run = rollout(MultiAgentVectorEnv(network, num_envs=2), Random())
     stock = 100.0 * np.exp(-0.2 * np.arange(6))
     left, held = stock[:-1] - stock[1:], (stock[:-1] + stock[1:]) / 2
-    np.testing.assert_allclose(run.booked[0], [7 * left + 3 * held, 0.5 * left], rtol=1e-12)
+    np.testing.assert_allclose(run.bookings[0], [7 * left + 3 * held, 0.5 * left], rtol=1e-12)
     discounted = (7 * left + 3 * held) @ 1.5 ** -(np.arange(5) + 0.5)
     np.testing.assert_allclose(run.accounts[1], [discounted, 0.5 * left.sum()], rtol=1e-12)
 
@@ -102,7 +102,7 @@ def test_every_view_books_the_same(seed: int, nodes: int, arcs: int, lifetimes: 
     totals = (by_flow * run.flow).sum(axis=(1, 2)) + (by_stock * (stock[1:] + stock[:-1]) / 2).sum(axis=(1, 2))
     size = (abs(by_flow) * run.flow).sum(axis=(1, 2)) + (abs(by_stock) * (stock[1:] + stock[:-1]) / 2).sum(axis=(1, 2))
     np.testing.assert_allclose(run.accounts[0], totals, atol=float(1e-12 * size.max(initial=1.0)))
-    np.testing.assert_array_equal(ledger.sums(run.entries.T).T, run.booked[0].T)
+    np.testing.assert_array_equal(ledger.sums(run.entries.T).T, run.bookings[0].T)
     alone = rollout(MultiAgentVectorEnv(network, num_envs=1), Random(), seed=seed)
     if np.array_equal(alone.flow, run.flow):  # who acts at random may act otherwise alone
         np.testing.assert_array_equal(alone.accounts[0], run.accounts[0])
@@ -116,7 +116,7 @@ def test_every_view_books_the_same(seed: int, nodes: int, arcs: int, lifetimes: 
     elsewhere = replace(network, nodes=tuple(replace(n, accounts={}) for n in network.nodes), arcs=tuple(moved))
     other = rollout(MultiAgentVectorEnv(elsewhere, num_envs=3), Random(), seed=seed)
     np.testing.assert_allclose(other.accounts, run.accounts, atol=float(1e-12 * size.max(initial=1.0)))
-    assert run.booked.shape == (3, 2, steps)
+    assert run.bookings.shape == (3, 2, steps)
 
 
 def _sum(first: dict[str, float | Series], second: dict[str, float | Series], account: str) -> float | Series:
@@ -364,8 +364,8 @@ def test_uncertain_and_disturbed_prices_are_each_copy_s_own() -> None:
     fibre = network.arc_index["virgin_fibre"]
     draws = env.physical.factors[0]
     assert len(set(draws.tolist())) == 4
-    np.testing.assert_allclose(run.booked[0, 0], 600 * draws[0] * run.flow[:, fibre], rtol=1e-12)
-    np.testing.assert_allclose(run.booked[0, 1], 0.2 * run.disturbances[0, :, 0] * run.flow[:, fibre], rtol=1e-12)
+    np.testing.assert_allclose(run.bookings[0, 0], 600 * draws[0] * run.flow[:, fibre], rtol=1e-12)
+    np.testing.assert_allclose(run.bookings[0, 1], 0.2 * run.disturbances[0, :, 0] * run.flow[:, fibre], rtol=1e-12)
     certain = env.certain_network(0)
     again = Ledger(certain).rates()[0] * run.flow
     np.testing.assert_allclose(again.sum(axis=(1, 2)), run.accounts[0], rtol=1e-12)
@@ -399,11 +399,11 @@ def test_the_front_of_two_aims_is_proved_and_reached(tmp_path: Path) -> None:
     write_network(city(), file)
     for axes in (("circularity", "emissions"), ("cost", "emissions")):
         front = account_front(file, axes, min_service=0.9, points=4)
-        at_plans = front.at(front.achieved[:, 1])
-        assert (front.sign * (at_plans - front.achieved[:, 0]) >= -1e-5 * abs(at_plans)).all()
-        np.testing.assert_allclose(front.at(front.budgets), front.proved, rtol=1e-4)
+        at_plans = front.at(front.plans[:, 1])
+        assert (front.sign * (at_plans - front.plans[:, 0]) >= -1e-5 * abs(at_plans)).all()
+        np.testing.assert_allclose(front.at(front.budgets), front.bounds, rtol=1e-4)
         assert (np.diff(front.prices) <= 1e-6 * front.prices[0]).all() and front.prices[0] > 0
-        assert (front.achieved[:, 1] <= front.budgets * (1 + 1e-4)).all() and (front.levels <= 1).all()
+        assert (front.plans[:, 1] <= front.budgets * (1 + 1e-4)).all() and (front.levels <= 1).all()
         proved, achieved = front.volumes
         assert 0.99 * proved <= achieved <= proved * (1 + 1e-5)
     out = ["--min-service", "0.9", "--points", "3", "--out", str(tmp_path / "front")]
@@ -424,7 +424,7 @@ def test_the_front_of_two_aims_is_proved_and_reached(tmp_path: Path) -> None:
 def test_emissions_of_the_first_year_are_near_those_reported(name: str, least: float, most: float) -> None:
     """worldsteel: 1.91 t CO2 a tonne of 1.89 Gt of steel; International Aluminium Institute: 1.11 Gt with rolling."""
     run = rollout(MultiAgentVectorEnv(name, num_envs=1, horizon=1), Neutral())
-    assert least <= float(run.booked[0, 0, 0]) <= most
+    assert least <= float(run.bookings[0, 0, 0]) <= most
 
 
 def test_copies_and_intervals_keep_what_is_booked() -> None:

@@ -88,7 +88,7 @@ def test_gradients_of_what_is_booked() -> None:
     totals = torch.zeros(2, 2, dtype=torch.float64)
     for actions in schedule:
         env.step(actions)
-        totals = totals + env.booked
+        totals = totals + env.bookings
     np.testing.assert_allclose(totals.detach().numpy(), exact.accounts, rtol=1e-12)
     (2.0 * totals[0] - totals[1]).sum().backward()  # type: ignore[no-untyped-call]
     assert schedule.grad is not None and np.abs(exact.actions).max() > 0

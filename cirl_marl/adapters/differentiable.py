@@ -42,7 +42,7 @@ class DifferentiableEnv:
         booked: discounted amounts that the last interval booked on accounts, shape (accounts, B).
     """
 
-    booked: Tensor
+    bookings: Tensor
     start: Tensor
     disturbances: Tensor
 
@@ -81,7 +81,7 @@ class DifferentiableEnv:
         if self._stock is None:
             raise ControlError("the environment has no state yet: call reset() first")
         outputs: Any = _Interval.apply(self._derivatives, self._stock, actions, self.disturbances)  # type: ignore[no-untyped-call]
-        self._stock, circularity, levels, observation, self.booked = outputs
+        self._stock, circularity, levels, observation, self.bookings = outputs
         return observation, circularity, levels
 
 

@@ -50,7 +50,7 @@ class Rollout:
     service: Annotated[Floats, "mean level of the services, shape (B, steps)"]
     levels: Annotated[Floats, "level of each service, shape (B, services, steps)"]
     entries: Annotated[Floats, "amount of each entry of the ledger, not discounted, first copy, (steps, entries)"]
-    booked: Annotated[Floats, "amount on each account, not discounted, shape (B, accounts, steps)"]
+    bookings: Annotated[Floats, "amount on each account, not discounted, shape (B, accounts, steps)"]
     accounts: Annotated[Floats, "amount on each account in all, discounted, shape (B, accounts)"]
     local_returns: Annotated[Floats, "sum of the local rewards of each agent, shape (agents, B)"]
     returns: Annotated[Floats, "sum of the rewards of each agent, shape (agents, B)"]
@@ -130,7 +130,7 @@ def rollout(
     circularity, mean, service = np.empty((3, env.num_envs, steps))
     levels = np.empty((env.num_envs, len(env.network.services), steps))
     entries = np.empty((steps, len(env.ledger.compartments)))
-    booked = np.empty((env.num_envs, len(env.network.accounts), steps))
+    bookings = np.empty((env.num_envs, len(env.network.accounts), steps))
     local, returns = np.zeros((2, len(env.agents), env.num_envs))
     stock, flow = np.empty((steps, len(env.network.stores))), np.empty((steps, len(env.network.arcs)))
     load, inner = np.empty((steps, len(batches.lines))), np.empty((steps, len(physics.visible)))
@@ -153,7 +153,7 @@ def rollout(
             shortage[t] = np.where(short > ROUNDING * np.abs(ordered_flow), short, 0.0).mean(axis=1)
         circularity[:, t], mean[:, t] = outcome.circularity, outcome.circularity_mean
         service[:, t], levels[:, :, t] = outcome.service_level, outcome.levels.T
-        entries[t], booked[:, :, t] = outcome.entries[:, 0], outcome.booked.T
+        entries[t], bookings[:, :, t] = outcome.entries[:, 0], outcome.bookings.T
         local += outcome.local
         returns += outcome.reward
         stock[t], flow[t] = rows.stocks(env.physical.stock)[:, 0], outcome.flow[:, 0]
@@ -175,7 +175,7 @@ def rollout(
         service,
         levels,
         entries,
-        booked,
+        bookings,
         env.physical.accounts.T,
         local,
         returns,

@@ -95,7 +95,7 @@ def schedule(
         (f"circularity at the end ({network.mass_unit})", run.circularity[0]),
         (f"mean circularity ({network.mass_unit})", run.circularity_mean[0]),
         ("service level (1)", run.service[0]),
-        *((f"{a.id} ({a.unit})", amount) for a, amount in zip(network.accounts, run.booked[0], strict=True)),
+        *((f"{a.id} ({a.unit})", amount) for a, amount in zip(network.accounts, run.bookings[0], strict=True)),
         *(
             (f"stock of {node.id} at the end ({network.mass_unit})", run.stock[:, i])
             for i, node in enumerate(network.stores)

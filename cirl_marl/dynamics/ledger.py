@@ -88,21 +88,21 @@ class Ledger:
         self,
         adjoint: Floats,
         flow: Floats,
-        held: Floats,
+        stock: Floats,
         step: Integers,
         factors: Floats | None,
         factor_adjoint: Floats | None,
     ) -> tuple[Floats, Floats]:
-        """Return derivatives by mean flows and by mean stocks ``held`` of those by discounted amounts, (accounts, B).
+        """Return derivatives by mean flows and by mean stocks of those by discounted amounts, (accounts, B).
 
         Those by the factors on rates are added to ``factor_adjoint``.
         """
-        stated = self._rates_in(step)
+        rates = self._rates_in(step)
         per_entry = (adjoint * self.discount.take(step, axis=1)).take(self.account, axis=0) * self._interval
         if factors is not None and factor_adjoint is not None:
-            table = np.broadcast_to(stated, per_entry.shape) * self._charged(np.concatenate([flow, held]))
+            table = np.broadcast_to(rates, per_entry.shape) * self._charged(np.concatenate([flow, stock]))
             self._factors.pull_back(table, per_entry, factor_adjoint)
-        by_charged = self._charged.transpose()(per_entry * self._factors(stated, factors))
+        by_charged = self._charged.transpose()(per_entry * self._factors(rates, factors))
         return by_charged[: len(flow)], by_charged[len(flow) :]
 
     def sums(self, entries: Floats) -> Floats:

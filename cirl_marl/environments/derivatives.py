@@ -59,9 +59,9 @@ class Derivatives:
     def advance(self, actions: Floats) -> tuple[Interval, Outputs]:
         """Hold stacked actions, shape (entries, B), for an interval, as ``MultiAgentVectorEnv.advance`` does."""
         env, outcome = self.env, self.env.advance(actions)
-        booked = env.interval.after.accounts - env.interval.before.accounts
+        bookings = env.interval.after.accounts - env.interval.before.accounts
         seen = self.observation()
-        return env.interval, Outputs(env.physical.stock, outcome.circularity_mean, outcome.levels, seen, booked)
+        return env.interval, Outputs(env.physical.stock, outcome.circularity_mean, outcome.levels, seen, bookings)
 
     def observation(self) -> Floats:
         """Return the present stacked observation in double precision, shape (entries of all agents, B)."""
@@ -90,9 +90,9 @@ class Derivatives:
         by_stock, by_start = by_quantity[signals.stocks], None
         if adjoint.accounts is not None and env.ledger.accounts:
             held = (env.rows.stocks(before.stock) + env.rows.stocks(after.stock)) / 2
-            booked = env.ledger.pull_back(adjoint.accounts, after.flow, held, step, factors, factor_adjoint)
-            by_flow += booked[0]
-            by_start = booked[1] / 2
+            bookings = env.ledger.pull_back(adjoint.accounts, after.flow, held, step, factors, factor_adjoint)
+            by_flow += bookings[0]
+            by_start = bookings[1] / 2
             by_stock = by_stock + by_start
         stock = adjoint.stock + env.rows.masses_adjoint(by_stock)
         inputs = IntervalInputs(before.stock, interval.controls, factors)

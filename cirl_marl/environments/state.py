@@ -89,7 +89,7 @@ class Outcome:
     service_level: Annotated[Floats, "their mean, shape (B,); 1 without services"]
     flow: Annotated[Floats, "mean flows, shape (arcs, B), mass/time"]
     entries: Annotated[Floats, "amount of each entry of the ledger, not discounted, shape (entries, B)"]
-    booked: Annotated[Floats, "amounts booked on accounts, not discounted, shape (accounts, B)"]
+    bookings: Annotated[Floats, "amounts booked on accounts, not discounted, shape (accounts, B)"]
     truncated: Annotated[NDArray[np.bool_], "time limit reached, shape (B,)"]
     success: Annotated[Mapping[str, NDArray[np.bool_]], "whether the task of a compartment's model is done, shape (B,)"]
 

@@ -318,8 +318,8 @@ class MultiAgentVectorEnv:
             **dict(zip(self._costs, costs, strict=True)),
         }
         if self.ledger.accounts:
-            outcome.booked.setflags(write=False)
-            info["accounts"] = dict(zip(self.ledger.accounts, outcome.booked, strict=True))
+            outcome.bookings.setflags(write=False)
+            info["accounts"] = dict(zip(self.ledger.accounts, outcome.bookings, strict=True))
         info |= self.drawn_info(np.maximum(self.physical.step - 1, 0))
         if (year := self.year) is not None:
             year.flags.writeable = False
@@ -400,12 +400,12 @@ class MultiAgentVectorEnv:
         circularity, mean, batch_mass = self._credit.circularity(state, transition, flow)
         reward = self._credit.pay(circularity, mean, local, terms, levels, state, controls)
         step = state.step + 1
-        entries = booked = accounts = state.accounts
+        entries = bookings = accounts = state.accounts
         if self.ledger.accounts:
             before, after = self.rows.stocks(state.stock), self.rows.stocks(transition.stock)
             entries = self.ledger.entries(flow, before, after, state.step, factors)
-            booked = self.ledger.sums(entries)
-            accounts = accounts + booked * self.ledger.discount.take(state.step, axis=1)
+            bookings = self.ledger.sums(entries)
+            accounts = accounts + bookings * self.ledger.discount.take(state.step, axis=1)
         totals = (state.circularity + mean, state.service + levels, accounts)
         measures = quantities[self.layout.signals.measures]
         drawn = (state.processes, state.disturbances)
@@ -416,7 +416,7 @@ class MultiAgentVectorEnv:
         observation = self.layout.observe(quantities, step / horizon, levels, self._sight(self._state))
         success = dynamics.inner.successes(transition.inner, controls)
         scores = (reward, local, circularity, mean, levels, service)
-        return Outcome(observation, *scores, flow, entries, booked, step >= horizon, success)
+        return Outcome(observation, *scores, flow, entries, bookings, step >= horizon, success)
 
     def go_back(self, state: State, controls: Floats) -> None:
         """Go back to a state of this episode, as ``physical`` gave it, and the ``controls`` that led to it."""

@@ -41,12 +41,12 @@ class AccountFront:
     axes: Annotated[tuple[str, str], "what is aimed at, and what has budgets"]
     min_service: Annotated[Floats, "mean level demanded of each service, shape (services,)"]
     budgets: Annotated[Floats, "shape (k,), rising"]
-    proved: Annotated[Floats, "best possible of the first, shape (k,)"]
+    bounds: Annotated[Floats, "best possible of the first, shape (k,)"]
     prices: Annotated[Floats, "what the first gains by one more of the budget, shape (k,)"]
-    achieved: Annotated[Floats, "what plans come to in the simulator, first and second, shape (k, 2)"]
+    plans: Annotated[Floats, "what plans come to in the simulator, first and second, shape (k, 2)"]
     levels: Annotated[Floats, "least mean level of a service under each plan, shape (k,)"]
     shortages: Annotated[Floats, "most that a plan is short of a service or exceeds its budget, relative, shape (k,)"]
-    usual: Annotated[Floats, "first and second under neutral control, shape (2,)"]
+    as_usual: Annotated[Floats, "first and second under neutral control, shape (2,)"]
 
     @property
     def sign(self) -> float:
@@ -61,7 +61,7 @@ class AccountFront:
 
     def at(self, budgets: ArrayLike) -> Floats:
         """Return what is proved of the first at other budgets."""
-        lines = self.sign * self.proved[:, None] + self.prices[:, None] * (np.ravel(budgets) - self.budgets[:, None])
+        lines = self.sign * self.bounds[:, None] + self.prices[:, None] * (np.ravel(budgets) - self.budgets[:, None])
         return self.sign * np.asarray(lines.min(axis=0))
 
     @property
@@ -70,11 +70,11 @@ class AccountFront:
 
         Plans that are short of what is demanded do not count.
         """
-        nadir = self.budgets[-1], float(self.sign * self.proved[0])
-        kept = self.achieved[self.shortages <= SERVED]
-        points = (np.stack([self.budgets, self.sign * self.proved]), kept.T[::-1] * [[1.0], [self.sign]])
-        proved, achieved = (area_dominated(second, first, *nadir) for second, first in points)
-        return proved, achieved
+        nadir = self.budgets[-1], float(self.sign * self.bounds[0])
+        served_plans = self.plans[self.shortages <= SERVED]
+        points = (np.stack([self.budgets, self.sign * self.bounds]), served_plans.T[::-1] * [[1.0], [self.sign]])
+        bounds, plans = (area_dominated(second, first, *nadir) for second, first in points)
+        return bounds, plans
 
 
 def area_dominated(second: Floats, first: Floats, most: float, least: float) -> float:
@@ -129,14 +129,14 @@ def account_front(
             f"{lowest:.6g} {definition.accounts[bounded.account].unit}, so that there is nothing to weigh"
         )
     budgets = np.linspace(lowest, highest, points)
-    solved, runs = [], []
+    solutions, runs = [], []
     for place, budget in enumerate(budgets.tolist()):
-        solved.append(bound(definition, aim=first, at_most={second: budget}, min_service=min_service))
+        solutions.append(bound(definition, aim=first, at_most={second: budget}, min_service=min_service))
         report = part_of(progress, "bounds and plans", place / points, 1 / points)
-        runs.append(simulate_plan(improve_plan(solved[-1], progress=report)))
+        runs.append(simulate_plan(improve_plan(solutions[-1], progress=report)))
     env = MultiAgentVectorEnv(definition, num_envs=1)
     origin = episode_start(env)
-    usual = rollout(env, Neutral(), seed=origin.seed, start=origin.initial_state)
+    as_usual = rollout(env, Neutral(), seed=origin.seed, start=origin.initial_state)
     sign = 1.0 if aims.account is None else -1.0
 
     def coordinates(run: Rollout) -> list[float]:
@@ -147,10 +147,10 @@ def account_front(
         axes=axes,
         min_service=np.zeros(0) if free.min_service is None else free.min_service,
         budgets=budgets,
-        proved=np.array([sign * each.objective for each in solved]),
-        prices=np.array([each.budget_prices[second] for each in solved]),
-        achieved=np.array([coordinates(run) for run in runs]),
+        bounds=np.array([sign * each.objective for each in solutions]),
+        prices=np.array([each.budget_prices[second] for each in solutions]),
+        plans=np.array([coordinates(run) for run in runs]),
         levels=np.array([float(run.least_service[0]) for run in runs]),
-        shortages=np.array([shortage(each, run) for each, run in zip(solved, runs, strict=True)]),
-        usual=np.array(coordinates(usual)),
+        shortages=np.array([shortage(each, run) for each, run in zip(solutions, runs, strict=True)]),
+        as_usual=np.array(coordinates(as_usual)),
     )

@@ -55,10 +55,10 @@ class Simulation:
         flows = (*run.flow.T, *env.network.throughput(run.flow.T))
         ages = [pyramid.mean_age for pyramid in pyramids(env.network, run, run.start)]
         insides = (*run.load.T, *run.inner.T, *(age[1:] for age in ages), *run.disturbances[0].T)
-        columns = (*lambdas, run.service[0], *run.booked[0], *run.stock.T, *flows, *insides)
+        columns = (*lambdas, run.service[0], *run.bookings[0], *run.stock.T, *flows, *insides)
         states = [*run.start_load.tolist(), *run.start_inner.tolist(), *(float(age[0]) for age in ages)]
         states += [None] * run.disturbances.shape[2]
-        first = [*[None] * (3 + len(run.booked[0])), *run.start.tolist(), *[None] * len(flows), *states]
+        first = [*[None] * (3 + len(run.bookings[0])), *run.start.tolist(), *[None] * len(flows), *states]
         times = np.concatenate([[0.0], interval_ends(env.network)])
         clock = zip(times.tolist(), *labels(env.network, times)[1], strict=True)
         rows = [first, *zip(*(column.tolist() for column in columns), strict=True)]

@@ -98,7 +98,7 @@ def front_table(front: AccountFront) -> Table:
         f"plan ({unit})",
         f"worth ({unit} per {other})",
     ]
-    columns = (front.budgets, front.proved, front.achieved[:, 0], front.prices)
+    columns = (front.budgets, front.bounds, front.plans[:, 0], front.prices)
     rows = [[f"{cell:.5g}" for cell in cells] for cells in zip(*(column.tolist() for column in columns), strict=True)]
     return text_table(f"{first} against {second}", headings, rows, text=[])
 
@@ -108,11 +108,11 @@ def write_account_front(front: AccountFront, folder: Path, **options: Any) -> li
     (first, second), (unit, other) = front.axes, front.units
     header = [f"budget of {second} ({other})", f"proved {first} ({unit})", f"worth of one more ({unit}/({other}))"]
     header += [f"planned {first} ({unit})", f"planned {second} ({other})", "least service level of the plan"]
-    columns = [front.budgets, front.proved, front.prices, *front.achieved.T, front.levels]
+    columns = [front.budgets, front.bounds, front.prices, *front.plans.T, front.levels]
     rows = [list(row) for row in zip(*(column.tolist() for column in columns), strict=True)]
-    proved, achieved = front.volumes
+    bounds, plans = front.volumes
     about: dict[str, Any] = {"provenance": provenance(front.network, **options), "columns": header, "points": rows}
-    about |= {"as_usual": front.usual.tolist(), "hypervolume": {"proved": proved, "plans": achieved}}
+    about |= {"as_usual": front.as_usual.tolist(), "hypervolume": {"proved": bounds, "plans": plans}}
     names = ("pareto.csv", "pareto.json", "pareto.png")
     with publish_folder(folder) as draft:
         write_table(draft / names[0], header, rows)
@@ -126,13 +126,13 @@ def save_account_front(path: str | Path, front: AccountFront, *, title: str = ""
     (first, second), (unit, other), network = front.axes, front.units, front.network
     figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
     axes = figure.subplots()
-    axes.plot(*front.achieved.T[::-1], marker="o", color=SERIES[0], label="plan in the simulator")
-    axes.plot(*front.usual[::-1], marker="s", linestyle="", color=SERIES[1], label="as usual")
+    axes.plot(*front.plans.T[::-1], marker="o", color=SERIES[0], label="plan in the simulator")
+    axes.plot(*front.as_usual[::-1], marker="s", linestyle="", color=SERIES[1], label="as usual")
     within = np.linspace(*axes.get_xlim(), 500)
-    proved = front.at(within)
-    axes.plot(within, proved, color=NEUTRAL, linewidth=1, label="best possible")
+    bounds = front.at(within)
+    axes.plot(within, bounds, color=NEUTRAL, linewidth=1, label="best possible")
     low, high = axes.get_ylim()
-    axes.fill_between(within, proved, high if front.sign > 0 else low, color=NEUTRAL, alpha=0.2, linewidth=0)
+    axes.fill_between(within, bounds, high if front.sign > 0 else low, color=NEUTRAL, alpha=0.2, linewidth=0)
     axes.set_ylim(low, high)
     axes.set_xlim(within[0], within[-1])
     label = "λ̄" if first == CIRCULARITY else readable(first)

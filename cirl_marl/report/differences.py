@@ -121,7 +121,7 @@ def _trajectory(simulation: Simulation, quantity: ComparedQuantity) -> tuple[Flo
     if quantity.kind == "service":
         return middle, episode.levels[0, [service.id for service in network.services].index(quantity.of)]
     if quantity.kind == "account":
-        return middle, episode.booked[0, [account.id for account in network.accounts].index(quantity.of)]
+        return middle, episode.bookings[0, [account.id for account in network.accounts].index(quantity.of)]
     if quantity.kind == "flow":
         return middle, episode.flow[:, network.arc_index[quantity.of]]
     row = network.node_index[quantity.of]  # nodes with a stock come first
