@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -36,12 +37,16 @@ from cirl_marl import (
 )
 from cirl_marl.cli import app
 from cirl_marl.controllers import Neutral, Random
-from cirl_marl.controllers.rollout import rollout
+from cirl_marl.controllers.rollout import Rollout, rollout
+from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.dynamics.ledger import Ledger
 from cirl_marl.network.disturbances import DisturbanceEffect, Markov
 from cirl_marl.network.uncertainty import Spread, network_of_intervals
 from cirl_marl.network.units import factor
-from cirl_marl.optimum import bound, improve, improve_plan, simulate_plan, smooth_plan
+from cirl_marl.optimum import bound, improve, improve_plan, simulate_plan, smooth, smooth_plan
+from cirl_marl.optimum.aims import Aims
+from cirl_marl.optimum.linearised import jacobians, step_program
+from cirl_marl.optimum.program import Programs
 
 
 def with_lambda(network: Network) -> Network:
@@ -455,3 +460,54 @@ def test_multipliers_of_a_budget_hold_at_other_starts() -> None:
         proved = float(found.at(start))
         assert own.objective - 1e-6 * abs(own.objective) <= proved <= own.objective + 0.2 * abs(own.objective)
         assert float(found.at()) == pytest.approx(found.objective, rel=1e-9)
+
+
+def test_a_step_of_a_plan_knows_what_it_books() -> None:
+    """To first order the program of a step has the account that is kept low, and the budget, as the simulator does."""
+    network = city()
+    solved = bound(network, aim="cost", min_service=0.9, at_most={"emissions": 3000.0})
+    rng, dynamics = np.random.default_rng(0), Dynamics(network)
+    middle = replace(solved, actions=rng.uniform(-0.5, 0.5, solved.actions.shape))
+    run = simulate_plan(middle)
+    program = step_program(middle, dynamics, run, np.array([0.9]), np.ones(2), 0.1, jacobians(middle, dynamics))
+    moves = np.zeros(len(program.origin))
+    moves[program.action] = 1e-4 * rng.uniform(-1, 1, program.action.shape)
+    trial = simulate_plan(replace(middle, actions=middle.actions + moves[program.action]))
+    books = trial.accounts[0] - run.accounts[0]
+    row = program.problem.under[[len(program.problem.under_to) - 1]].toarray()[0]
+    assert program.problem.cost @ moves == pytest.approx(books[0], rel=1e-3)
+    assert row @ moves == pytest.approx(books[1], rel=1e-3)
+    assert program.problem.under_to[-1] == pytest.approx(3000.0 - run.accounts[0, 1])
+    corrected = program.with_correction(moves, run, trial)
+    assert corrected.problem.under_to[-1] == pytest.approx(3000.0 - trial.accounts[0, 1] + row @ moves, rel=1e-9)
+
+
+def test_what_exceeds_a_budget_is_charged_and_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plans over their budget are worth less; the next program of a large network has that much less to spend."""
+    network = city()
+    solved = bound(network, min_service=0.9, at_most={"emissions": 3000.0})
+    run = simulate_plan(solved)
+    tight = replace(solved, aims=replace(solved.aims, budgets={1: float(run.accounts[0, 1]) - 100.0}))
+    rates = np.array([0.0, 2.0])
+    values = [improve.penalised_objective(plan, run, rates) for plan in (solved, tight)]
+    assert values[1] == pytest.approx(float(run.episode_circularity[0]) - 200.0)
+    assert values[0] >= values[1] + 199.0
+    assert improve.shortage(tight, run) == pytest.approx(100.0 / (float(run.accounts[0, 1]) - 100.0), rel=1e-6)
+    good: Any = SimpleNamespace(run=run, bound=solved)
+    bad: Any = SimpleNamespace(run=_with_more(run, 1.01), bound=solved)
+    assert smooth._as_good(good, good) and not smooth._as_good(bad, good)
+    budgets: list[float] = []
+    program = Programs.program
+
+    def recorded(self: Programs, initial: Any, min_service: Any = None, **options: Any) -> Any:
+        budgets.append(options["aims"].limits[0])
+        return program(self, initial, min_service, **options)
+
+    monkeypatch.setattr(Programs, "program", recorded)
+    monkeypatch.setattr(Aims, "excess", lambda self, run: np.array([5.0]))
+    improve.refine(solved)
+    assert budgets == [2995.0, 2990.0]
+
+
+def _with_more(run: Rollout, factor: float) -> Rollout:
+    return replace(run, accounts=np.maximum(run.accounts, 3000.0) * factor)
