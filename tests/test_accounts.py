@@ -29,6 +29,7 @@ from cirl_marl import (
     Role,
     Series,
     account_front,
+    gradient,
     load_network,
     mo_parallel_env,
     parallel_env,
@@ -511,3 +512,21 @@ def test_what_exceeds_a_budget_is_charged_and_asked_for_again(monkeypatch: pytes
 
 def _with_more(run: Rollout, factor: float) -> Rollout:
     return replace(run, accounts=np.maximum(run.accounts, 3000.0) * factor)
+
+
+def test_gradients_by_uncertain_and_disturbed_prices() -> None:
+    """A total is linear in a factor on one of its rates: the derivative is what that rate books at a factor of 1."""
+    network = replace(
+        city(),
+        uncertain={"arcs.feed.accounts.cost": Spread(low=0.5, high=1.5, distribution="uniform")},
+        disturbances={"carbon": Markov(values=(1.0, 3.0), matrix=((0.5, 0.5), (0.5, 0.5)))},
+        disturbed={"arcs.feed.accounts.emissions": DisturbanceEffect(by="carbon")},
+    ).with_options(episode={"horizon": 3})
+    env = MultiAgentVectorEnv(network, num_envs=2, uncertain=True)
+    env.reset(seed=1)
+    actions = env.stack(env.neutral_action)[None].repeat(3, axis=0)
+    found = gradient(env, actions, circularity=0.0, accounts=[1.0, 1.0])
+    run = rollout(env, Neutral(), seed=1)
+    flow, discount = run.flow[:, network.arc_index["feed"]], env.ledger.discount
+    np.testing.assert_allclose(found.draws[0, 0], 90 * (discount[0, :3] @ flow), rtol=1e-10)
+    np.testing.assert_allclose(found.disturbances[:3, 0, 0], 0.6 * discount[1, :3] * flow, rtol=1e-10)
