@@ -34,6 +34,7 @@ from cirl_marl import (
     mo_parallel_env,
     parallel_env,
     plan,
+    simulate,
     write_network,
 )
 from cirl_marl.cli import app
@@ -48,6 +49,8 @@ from cirl_marl.optimum import bound, improve, improve_plan, simulate_plan, smoot
 from cirl_marl.optimum.aims import Aims
 from cirl_marl.optimum.linearised import jacobians, step_program
 from cirl_marl.optimum.program import Programs
+from cirl_marl.report.page_data import page_data
+from cirl_marl.report.report_page import page_of_alternatives
 
 
 def with_lambda(network: Network) -> Network:
@@ -412,6 +415,7 @@ def test_the_front_of_two_aims_is_proved_and_reached(tmp_path: Path) -> None:
         assert (front.plans[:, 1] <= front.budgets * (1 + 1e-4)).all() and (front.levels <= 1).all()
         proved, achieved = front.volumes
         assert 0.99 * proved <= achieved <= proved * (1 + 1e-5)
+        assert replace(front, shortages=np.ones(4)).volumes == (proved, 0.0)
     out = ["--min-service", "0.9", "--points", "3", "--out", str(tmp_path / "front")]
     result = CliRunner().invoke(app, ["pareto", str(file), "--between", "cost,emissions", *out])
     assert result.exit_code == 0, result.output
@@ -466,6 +470,9 @@ def test_multipliers_of_a_budget_hold_at_other_starts() -> None:
 def test_a_step_of_a_plan_knows_what_it_books() -> None:
     """To first order the program of a step has the account that is kept low, and the budget, as the simulator does."""
     network = city()
+    # so that what is held counts as much as what flows
+    nodes = tuple(replace(n, holding={"cost": 5.0}) if n.holding else n for n in network.nodes)
+    network = replace(network, nodes=nodes)
     solved = bound(network, aim="cost", min_service=0.9, at_most={"emissions": 3000.0})
     rng, dynamics = np.random.default_rng(0), Dynamics(network)
     middle = replace(solved, actions=rng.uniform(-0.5, 0.5, solved.actions.shape))
@@ -479,6 +486,8 @@ def test_a_step_of_a_plan_knows_what_it_books() -> None:
     assert program.problem.cost @ moves == pytest.approx(books[0], rel=1e-3)
     assert row @ moves == pytest.approx(books[1], rel=1e-3)
     assert program.problem.under_to[-1] == pytest.approx(3000.0 - run.accounts[0, 1])
+    moves *= 3000.0
+    trial = simulate_plan(replace(middle, actions=np.clip(middle.actions + moves[program.action], -1.0, 1.0)))
     corrected = program.with_correction(moves, run, trial)
     assert corrected.problem.under_to[-1] == pytest.approx(3000.0 - trial.accounts[0, 1] + row @ moves, rel=1e-9)
 
@@ -530,3 +539,17 @@ def test_gradients_by_uncertain_and_disturbed_prices() -> None:
     flow, discount = run.flow[:, network.arc_index["feed"]], env.ledger.discount
     np.testing.assert_allclose(found.draws[0, 0], 90 * (discount[0, :3] @ flow), rtol=1e-10)
     np.testing.assert_allclose(found.disturbances[:3, 0, 0], 0.6 * discount[1, :3] * flow, rtol=1e-10)
+
+
+def test_pages_show_what_is_booked() -> None:
+    """Each interval's amounts, and the totals of episodes, with their units."""
+    simulation = simulate(city(), "scripted", steps=5)
+    page = page_data(page_of_alternatives([simulation]))
+    run = simulation.rollout
+    assert [(each["id"], each["unit"]) for each in page["networks"][0]["accounts"]] == [
+        ("cost", "EUR_2023"),
+        ("emissions", "t CO2e"),
+    ]
+    (scene,) = page["scenes"]
+    np.testing.assert_allclose([each["value"] for each in scene["accounts"]], run.bookings[0], rtol=1e-5)
+    assert scene["figures"]["account:cost"][0] == pytest.approx(run.accounts[0, 0], rel=1e-5)

@@ -133,6 +133,10 @@ def _network(network: Network, episodes: Sequence[PageEpisode]) -> Values:
             {"id": name, "unit": part.unit}
             for name, part in zip(network.processes.names, network.processes.disturbances, strict=True)
         ],
+        "accounts": [
+            {"id": part.id, "label": part.title or part.id.replace("_", " "), "unit": part.unit}
+            for part in network.accounts
+        ],
         "settings": controls,
         "sketches": [_diagram(diagram) for diagram in flow_diagrams(network, peaks)],
     }
@@ -173,6 +177,7 @@ def _episode(episode: PageEpisode, network: int) -> Values:
         "lambda": _band(episode.circularity),
         "services": [_band(level) for level in episode.levels],
         "disturbances": [_band(values) for values in episode.disturbances],
+        "accounts": [_band(values) for values in episode.accounts],
         "about": episode.about,
         "figures": {name: _aggregate(figure) for name, figure in episode.figures.items() if figure is not None},
     }

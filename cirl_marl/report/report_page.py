@@ -62,6 +62,7 @@ class PageEpisode:
         default_factory=dict
     )
     disturbances: Annotated[tuple[Band, ...], "values of each disturbance"] = ()
+    accounts: Annotated[tuple[Band, ...], "amount on each account in each interval"] = ()
 
 
 @positional_record
@@ -234,6 +235,8 @@ def _episode(
     found = indicators(network, outcome.mean_flow)
     shares = {"recycling_rate": found.recycling_rate, "recycled_content": found.recycled_content} if found else {}
     figures = {**figures, **{which: Aggregate(share, np.nan, np.nan) for which, share in shares.items()}}
+    totals = zip(network.accounts, outcome.accounts.T, strict=True)
+    figures |= {f"account:{account.id}": over_episodes(total) for account, total in totals}
     return PageEpisode(
         name=name,
         network=network,
@@ -247,6 +250,7 @@ def _episode(
         about=CONFIDENCE.format(count) if count > 1 else "",
         figures=figures,
         disturbances=tuple(_mean(values, np.inf) for values in np.moveaxis(outcome.disturbances, 2, 0)),
+        accounts=tuple(_mean(values, np.inf) for values in np.moveaxis(outcome.bookings, 1, 0)),
     )
 
 

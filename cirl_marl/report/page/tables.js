@@ -4,16 +4,17 @@ import { make, part, shown, tableOf } from "./elements.js";
 import { csv, figure, measured, percent, ranged } from "./figures.js";
 
 const HEADER = ["scene", "step", "from", "to", "when", "kind", "id", "name", "value", "low", "high", "unit"];
-const GROUPS = { circularity: "Circularity and service", stock: "Stocks and throughputs", flow: "Flows", control: "What agents set" };
+const GROUPS = { circularity: "Circularity, service, accounts", stock: "Stocks and throughputs", flow: "Flows", control: "What agents set" };
 
 /** Every quantity of a scene: its kind, id, name, unit and values, one for each step, and at step 0 where there is one. */
 export function quantitiesOf(story, scene) {
-  const { nodes, arcs, services, disturbances, settings } = story.networks[scene.network];
+  const { nodes, arcs, services, accounts, disturbances, settings } = story.networks[scene.network];
   const flow = `${story.mass}/${story.time}`;
   const of = (kind, id, name, unit, band) => ({ kind, id, name, unit, ...band, first: 1 });
   return [
     of("circularity", "", "λ, mean of the interval", story.mass, scene.lambda),
     ...services.map((each, s) => of("service", each.id, `service: ${each.label}`, "1", scene.services[s])),
+    ...accounts.filter((_, n) => scene.accounts[n]).map((each, n) => of("account", each.id, `account: ${each.label}`, each.unit, scene.accounts[n])),
     ...disturbances.map((each, n) => of("disturbance", each.id, `disturbance: ${each.id}`, each.unit, scene.disturbances[n])),
     ...nodes.map((node, i) => {
       const about = node.stores ? ["stock", story.mass] : ["throughput", flow];
@@ -38,7 +39,7 @@ export function everything(story) {
     }
     const empty = ["", "", "", ""];
     for (const [which, [value, low, high]] of Object.entries(scene.figures)) {
-      rows.push([scene.name, ...empty, "outcome", which, which, value, low, high, ["circularity", "bound"].includes(which) ? story.mass : "1"]);
+      rows.push([scene.name, ...empty, "outcome", which, which, value, low, high, unitOf(story, which)]);
     }
   }
   const point = (name, about, service, lambda) => {
@@ -48,6 +49,17 @@ export function everything(story) {
   for (const each of story.points) point(each.name, each.about, each.service, each.lambda);
   for (const [service, lambda] of story.front) point("bound", "", service, lambda);
   return rows;
+}
+
+/** The accounts of all networks, one for each id. */
+function accountsOf(story) {
+  return [...new Map(story.networks.flatMap((network) => network.accounts).map((each) => [each.id, each])).values()];
+}
+
+/** The unit of a figure of whole episodes. */
+function unitOf(story, which) {
+  const account = accountsOf(story).find((each) => which === `account:${each.id}`);
+  return account ? account.unit : ["circularity", "bound"].includes(which) ? story.mass : "1";
 }
 
 /** Shows what came of whole episodes. */
@@ -60,6 +72,7 @@ export function outcomeOf(story) {
     gap: ["gap to the bound", percent],
     recycling_rate: ["end-of-life recycling rate", percent],
     recycled_content: ["recycled content", percent],
+    ...Object.fromEntries(accountsOf(story).map((each) => [`account:${each.id}`, [`${each.label} / ${each.unit}`, figure]])),
   };
   const there = Object.keys(forms).filter((which) => story.scenes.some((scene) => scene.figures[which]));
   if (!there.length) return;
@@ -85,7 +98,7 @@ export function figuresOf(story, file) {
   const pick = make("select", { id: "kind" }, ...Object.entries(GROUPS).map(([value, name]) => make("option", { value }, name)));
   part("tools").append(make("label", { for: "kind" }, "Show "), pick, save);
   const found = story.scenes.map((scene) => new Map(quantitiesOf(story, scene).map((each) => [`${each.kind} ${each.id} ${each.name}`, each])));
-  const kinds = { circularity: ["circularity", "service", "disturbance"], stock: ["stock", "throughput"], flow: ["flow"], control: ["control"] };
+  const kinds = { circularity: ["circularity", "service", "account", "disturbance"], stock: ["stock", "throughput"], flow: ["flow"], control: ["control"] };
   let last = 1;
   const fill = (step) => {
     last = step;
