@@ -212,7 +212,7 @@ def test_no_episode_books_less_than_the_bound(network: Network, interval: float,
 
 def test_budgets_are_kept_at_a_price_between_the_difference_quotients() -> None:
     """The multiplier of a budget of carbon is its price, within 1 % of quotients of solved programs."""
-    network = city()
+    network = city().with_options(episode={"horizon": 30})
     free = bound(network, min_service=0.95)
     least = bound(network, aim="emissions", min_service=0.95)
     budget = float(0.5 * (free.accounts[1] - least.objective))
@@ -383,7 +383,7 @@ def test_uncertain_and_disturbed_prices_are_each_copy_s_own() -> None:
 def test_the_command_line_writes_and_plans(tmp_path: Path) -> None:
     """``simulate`` says totals and writes who books what; ``plan`` keeps costs low under a budget."""
     file = tmp_path / "city.toml"
-    write_network(city(), file)
+    write_network(city().with_options(episode={"horizon": 14}), file)
     result = CliRunner().invoke(app, ["simulate", str(file), "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
     assert "accounts: cost" in result.output
