@@ -6,7 +6,7 @@ import csv
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 import pytest
@@ -29,6 +29,7 @@ from cirl_marl import (
     Role,
     Series,
     account_front,
+    compare,
     gradient,
     load_network,
     mo_parallel_env,
@@ -42,6 +43,8 @@ from cirl_marl.controllers import Neutral, Random
 from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.dynamics.ledger import Ledger
+from cirl_marl.evaluation.episode_count import concatenation
+from cirl_marl.evaluation.sampling import sample_episodes, sensitivities
 from cirl_marl.network.disturbances import DisturbanceEffect, Markov
 from cirl_marl.network.uncertainty import Spread, network_of_intervals
 from cirl_marl.network.units import factor
@@ -51,6 +54,8 @@ from cirl_marl.optimum.linearised import jacobians, step_program
 from cirl_marl.optimum.program import Programs
 from cirl_marl.report.page_data import page_data
 from cirl_marl.report.report_page import page_of_alternatives
+from cirl_marl.report.samples import write_samples
+from cirl_marl.report.tradeoffs import summary_of
 
 
 def with_lambda(network: Network) -> Network:
@@ -553,3 +558,24 @@ def test_pages_show_what_is_booked() -> None:
     (scene,) = page["scenes"]
     np.testing.assert_allclose([each["value"] for each in scene["accounts"]], run.bookings[0], rtol=1e-5)
     assert scene["figures"]["account:cost"][0] == pytest.approx(run.accounts[0, 0], rel=1e-5)
+
+
+def test_samples_and_comparisons_tell_what_is_booked(tmp_path: Path) -> None:
+    """An uncertain price spreads costs and nothing else, and is named as what causes that; batches of episodes add."""
+    price = {"arcs.virgin_fibre.accounts.cost": Spread(deviation=0.2)}
+    network = replace(city(), uncertain=price).with_options(episode={"horizon": 10})
+    samples = sample_episodes(network, samples=80)
+    assert np.ptp(samples.accounts[:, 0]) > 0 and np.ptp(samples.accounts[:, 1]) <= 1e-9 * samples.accounts[:, 1].max()
+    by_figure = {cause.figure: cause.shares[0] for cause in sensitivities(samples)}
+    assert by_figure["cost"] > 0.9 and np.isnan(by_figure["emissions"])
+    bands, draws, *_ = write_samples(tmp_path, "city", samples, [], title="city")
+    assert "cost,EUR_2023" in bands.read_text() and "cost (EUR_2023)" in draws.read_text().splitlines()[0]
+    parts = [rollout(MultiAgentVectorEnv(network, num_envs=n), Random(), seed=seed) for n, seed in ((2, 1), (3, 9))]
+    whole = concatenation(*parts)
+    notes = {name: note.__metadata__[0] for name, note in get_type_hints(Rollout, include_extras=True).items()}
+    episodes = {name for name, note in notes.items() if "shape (B," in note}
+    assert {"accounts", "bookings", "levels"} <= episodes
+    assert all(len(getattr(whole, name)) == 5 for name in episodes)
+    found = compare([], ["neutral"], network=network, episodes=3, bounds=False)
+    told = summary_of(found)["rows"][0]["accounts"]["emissions"]["value"]
+    assert told == pytest.approx(float(found.entries[0].rollout.accounts[:, 1].mean()))

@@ -104,6 +104,8 @@ def _sample(
     figures = [("λ̄", f" {network.mass_unit}", ".5g", episodes.circularity.mean(axis=1))]
     levels = zip(network.services, episodes.levels.mean(axis=2).T, strict=True)
     figures += [(f"level of {service.id}", "", ".4f", level) for service, level in levels]
+    totals = zip(network.accounts, episodes.accounts.T, strict=True)
+    figures += [(account.id, f" {account.unit}", ".5g", total) for account, total in totals]
     for name, unit, form, values in figures:
         low, median, high = np.quantile(values, (0.025, 0.5, 0.975)).tolist()
         spread = f"median {median:{form}}{unit}, 95 % of samples in [{low:{form}}, {high:{form}}]"

@@ -34,10 +34,11 @@ class Ledger:
         self.accounts = tuple(account.id for account in network.accounts)
         self._interval = network.episode.control_interval
         inflows: list[list[int]] = [[] for _ in network.nodes]
-        for k, recipient in enumerate(network.recipients.tolist()):
+        for k, recipient in enumerate(network.recipients.tolist() if self.accounts else ()):
             inflows[recipient].append(k)
         arcs, entries = len(network.arcs), []
-        for kind, parts in (("nodes", network.nodes), ("arcs", network.arcs)):
+        groups = (("nodes", network.nodes), ("arcs", network.arcs)) if self.accounts else ()
+        for kind, parts in groups:
             for i, part in enumerate(parts):
                 for name, declaration in declarations(type(part)).items():
                     if not isinstance(declaration, Rates):

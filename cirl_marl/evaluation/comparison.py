@@ -125,6 +125,11 @@ class Row:
         rows = np.moveaxis(np.array([entry.rollout.episode_levels for entry in self.entries]), 2, 0)
         return [over_seeds([row.mean(axis=1)]) if len(row) > 1 else over_episodes(row[0], SHARE) for row in rows]
 
+    def accounts(self) -> list[Aggregate]:
+        """Return the total of each account, likewise."""
+        rows = np.moveaxis(np.array([entry.rollout.accounts for entry in self.entries]), 2, 0)
+        return [over_seeds([row.mean(axis=1)]) if len(row) > 1 else over_episodes(row[0]) for row in rows]
+
     def worst(self) -> list[Aggregate]:
         """Return the mean of the 5 % worst episodes of λ̄, then of the level of each service, likewise."""
         figures = [np.column_stack([entry.circularity, entry.rollout.episode_levels]) for entry in self.entries]

@@ -50,7 +50,7 @@ def concatenation(first: Rollout, second: Rollout) -> Rollout:
     """Return the episodes of two rollouts of one controller as one; what is of the first copy is of the first."""
     share = len(first.circularity) / (len(first.circularity) + len(second.circularity))
     along = {"circularity": 0, "circularity_mean": 0, "service": 0, "levels": 0, "disturbances": 0}
-    along |= {"local_returns": 1, "returns": 1}
+    along |= {"bookings": 0, "accounts": 0, "local_returns": 1, "returns": 1}
     changes = {name: np.concatenate([getattr(r, name) for r in (first, second)], axis) for name, axis in along.items()}
     for name in ("shortage", "final_stock", "mean_flow"):  # means over copies
         changes[name] = share * getattr(first, name) + (1.0 - share) * getattr(second, name)

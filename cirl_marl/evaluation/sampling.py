@@ -31,6 +31,8 @@ class SampledEpisodes:
     factors: Annotated[Floats, "what was drawn, relative to what is stated, shape (samples, numbers)"]
     circularity: Annotated[Floats, "mean of λ over each interval, shape (samples, steps), mass"]
     levels: Annotated[Floats, "level of each service, shape (samples, services, steps)"]
+    bookings: Annotated[Floats, "amount on each account, not discounted, shape (samples, accounts, steps)"]
+    accounts: Annotated[Floats, "total of each account, discounted, shape (samples, accounts)"]
     stock: Annotated[Floats, "stocks after each interval, shape (samples, steps, stores), mass"]
     flow: Annotated[Floats, "mean flows of each interval, shape (samples, steps, arcs), mass/time"]
     disturbances: Annotated[Floats, "their values in each interval, shape (samples, steps, names)"]
@@ -83,8 +85,8 @@ def sample_episodes(
     first, middle = first_seed(seed), episode_start(env).initial_state
     run = rollout(env, named_controller(control), seed=first, start=middle, progress=progress, watch=keep)
     factors = env.physical.factors.T.copy()
-    names, outcome = tuple(network.uncertain), (run.circularity_mean, run.levels, stock, flow, run.disturbances)
-    return SampledEpisodes(network, names, factors, *outcome)
+    figures = (run.circularity_mean, run.levels, run.bookings, run.accounts)
+    return SampledEpisodes(network, tuple(network.uncertain), factors, *figures, stock, flow, run.disturbances)
 
 
 def rbd_fast() -> ModuleType:
@@ -97,7 +99,7 @@ def rbd_fast() -> ModuleType:
 
 
 def sensitivities(episodes: SampledEpisodes) -> list[Sensitivity]:
-    """Return what causes the spread of λ̄, and of the mean level of each service.
+    """Return what causes the spread of λ̄, of the mean level of each service, and of the total of each account.
 
     The indices are estimated from the samples themselves, by RBD-FAST (Tarantola, Gatelli and Mara 2006) with the
     correction of Tissot and Prieur (2012), as SALib has them. They sum to less than 1 where numbers act together.
@@ -117,6 +119,7 @@ def sensitivities(episodes: SampledEpisodes) -> list[Sensitivity]:
     figures = {"λ̄": episodes.circularity.mean(axis=1)}
     levels = episodes.levels.mean(axis=2)
     figures |= {f"level of {service.id}": levels[:, s] for s, service in enumerate(episodes.network.services)}
+    figures |= {account.id: episodes.accounts[:, a] for a, account in enumerate(episodes.network.accounts)}
     causes = []
     for name, values in figures.items():
         if np.ptp(values) <= 1e-12 * np.abs(values).max(initial=0.0):

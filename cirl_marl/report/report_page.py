@@ -117,6 +117,7 @@ def page_of_samples(samples: SampledEpisodes, control: str) -> ReportPage:
         levels=tuple(_quantiles(samples.levels[:, s]) for s in range(len(network.services))),
         about=SAMPLES.format(count),
         disturbances=tuple(map(_quantiles, np.moveaxis(samples.disturbances, 2, 0))),
+        accounts=tuple(map(_quantiles, np.moveaxis(samples.bookings, 1, 0))),
     )
     draws = tuple(
         replace(
@@ -128,6 +129,7 @@ def page_of_samples(samples: SampledEpisodes, control: str) -> ReportPage:
             levels=tuple(map(Band, samples.levels[i])),
             about="",
             disturbances=tuple(map(Band, samples.disturbances[i].T)),
+            accounts=tuple(map(Band, samples.bookings[i])),
         )
         for i in range(min(SHOWN, count))
     )

@@ -76,9 +76,10 @@ def _draws(samples: SampledEpisodes) -> tuple[list[str], list[list[object]]]:
     network = samples.network
     header = ["sample", *(f"factor on {name}" for name in samples.names), f"mean circularity ({network.mass_unit})"]
     header += [f"mean level of {service.id}" for service in network.services]
+    header += [f"{account.id} ({account.unit})" for account in network.accounts]
     header += [f"mean of {name}" for name in disturbance_columns(network)]
     columns = [samples.factors, samples.circularity.mean(axis=1)[:, None], samples.levels.mean(axis=2)]
-    columns.append(samples.disturbances.mean(axis=1))
+    columns += [samples.accounts, samples.disturbances.mean(axis=1)]
     return header, [[i, *row] for i, row in enumerate(np.concatenate(columns, axis=1).tolist())]
 
 
@@ -94,6 +95,7 @@ def _quantities(samples: SampledEpisodes) -> Iterator[tuple[str, str, Floats]]:
     mass, flow = network.mass_unit, f"{network.mass_unit}/{network.time_unit}"
     yield "mean circularity", mass, samples.circularity
     yield from ((f"level of {service.id}", "1", samples.levels[:, s]) for s, service in enumerate(network.services))
+    yield from ((account.id, account.unit, samples.bookings[:, a]) for a, account in enumerate(network.accounts))
     yield from ((f"stock of {node.id}", mass, samples.stock[:, :, i]) for i, node in enumerate(network.stores))
     yield from ((f"flow of {arc.id}", flow, samples.flow[:, :, k]) for k, arc in enumerate(network.arcs))
     parts = zip(network.processes.names, network.processes.disturbances, strict=True)

@@ -165,6 +165,8 @@ def summary_of(comparison: Comparison, **options: Any) -> dict[str, Any]:
         plain["worst_circularity"] = worst.as_dict()
         for name, parts in (("service_levels", levels), ("worst_service_levels", worst_levels)):
             plain[name] = {id_: part.as_dict() for id_, part in zip(ids, parts, strict=True)}
+        totals = zip(comparison.network.accounts, row.accounts(), strict=True)
+        plain["accounts"] = {account.id: total.as_dict() for account, total in totals}
         calibration = row.entries[0].calibration
         plain["milliseconds"] = _milliseconds(row)
         plain["calibration"] = (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from cirl_marl.errors import CirlError, unknown_name
-from cirl_marl.network.declarations import Rates, bound_problems, declarations
+from cirl_marl.network.declarations import bound_problems
 from cirl_marl.network.elements import CIRCULARITY, Node
 from cirl_marl.network.specification import Specification
 from cirl_marl.network.units import factor
@@ -27,11 +27,13 @@ def account_problems(network: Specification) -> Iterator[str]:
             yield f"{subject}: {error}"
     accounts = [account.id for account in network.accounts]
     for part in (*network.nodes, *network.arcs):
+        holding = part.holding if isinstance(part, Node) else ()
+        if not part.accounts and not holding:
+            continue  # by far the most usual
         subject = f"{type(part).__name__.lower()} '{part.id}'"
-        for name, declaration in declarations(type(part)).items():
-            if isinstance(declaration, Rates):
-                for account, _ in getattr(part, name):
-                    if account not in accounts:
-                        yield f"{subject}: {name}: {unknown_name('account', account, accounts)}"
-        if isinstance(part, Node) and part.holding and not part.stores:
+        for name, rates in (("accounts", part.accounts), ("holding", holding)):
+            for id_ in dict(rates):
+                if id_ not in accounts:
+                    yield f"{subject}: {name}: {unknown_name('account', id_, accounts)}"
+        if isinstance(part, Node) and holding and not part.stores:
             yield f"{subject}: holding: it stores nothing; charge what enters it, under accounts"
