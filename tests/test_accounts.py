@@ -31,6 +31,7 @@ from cirl_marl import (
     account_front,
     compare,
     gradient,
+    levers,
     load_network,
     mo_parallel_env,
     parallel_env,
@@ -52,6 +53,7 @@ from cirl_marl.optimum import bound, improve, improve_plan, simulate_plan, smoot
 from cirl_marl.optimum.aims import Aims
 from cirl_marl.optimum.linearised import jacobians, step_program
 from cirl_marl.optimum.program import Programs
+from cirl_marl.report.lever_chart import levers_table, write_levers
 from cirl_marl.report.page_data import page_data
 from cirl_marl.report.report_page import page_of_alternatives
 from cirl_marl.report.samples import write_samples
@@ -579,3 +581,20 @@ def test_samples_and_comparisons_tell_what_is_booked(tmp_path: Path) -> None:
     found = compare([], ["neutral"], network=network, episodes=3, bounds=False)
     told = summary_of(found)["rows"][0]["accounts"]["emissions"]["value"]
     assert told == pytest.approx(float(found.entries[0].rollout.accounts[:, 1].mean()))
+
+
+@pytest.mark.slow
+def test_levers_tell_what_they_add_to_accounts(tmp_path: Path) -> None:
+    """Alone, with those above, which adds up, and left out; the table has what each does alone."""
+    found = levers(city().with_options(episode={"horizon": 20}), min_service=0.9)
+    changes = np.array([found.account_changes(row) for row in range(len(found.rows))])
+    together = found.together.run.accounts[0] - found.usual.run.accounts[0]
+    np.testing.assert_allclose(changes[:, 1].sum(axis=0), together, rtol=1e-9)
+    alone = found.rows[0].alone.run.accounts[0] - found.usual.run.accounts[0]
+    np.testing.assert_allclose(changes[0, 0], alone)
+    path, *_ = write_levers(found, tmp_path / "levers")
+    with path.open(encoding="utf-8") as lines:
+        rows = list(csv.DictReader(lines))
+    told = [float(row["alone: change of emissions (t CO2e)"]) for row in rows]
+    np.testing.assert_allclose(told, changes[:, 0, 1], rtol=1e-9)
+    assert any("emissions, alone" in str(column.header) for column in levers_table(found).columns)

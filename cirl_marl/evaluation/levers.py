@@ -18,7 +18,7 @@ from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, unknown_name, whole_number
 from cirl_marl.evaluation.comparison import ProgressReport, part_of
-from cirl_marl.network import Network
+from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.bounds import Bound, bound, gap
 from cirl_marl.optimum.improve import PENALTY, improve_plan, penalised_objective, prices
@@ -94,6 +94,12 @@ class Levers:
             lever.added.circularity - before.circularity,
             self.together.circularity - lever.without.circularity,
         )
+
+    def account_changes(self, row: int) -> Floats:
+        """Return what the lever of a row adds to the total of each account in the same three ways, (3, accounts)."""
+        lever, before = self.rows[row], self.usual if row == 0 else self.rows[row - 1].added
+        pairs = ((lever.alone, self.usual), (lever.added, before), (self.together, lever.without))
+        return np.array([trial.run.accounts[0] - reference.run.accounts[0] for trial, reference in pairs])
 
     def share(self, row: int) -> float:
         """Return the part of what all levers bring that those up to a row bring together; NaN if that is nothing."""

@@ -21,16 +21,22 @@ CASES = ("alone", "with those above", "without it")
 
 
 def levers_table(levers: Levers) -> Table:
-    """One row a lever: what λ̄ gains by it in three ways, and the lowest service and largest gap of these episodes."""
+    """One row a lever: what λ̄ gains by it in three ways, and the lowest service and largest gap of these episodes.
+
+    Beside that stands what it alone adds to each account.
+    """
     rows = []
     for place, row in enumerate(levers.rows):
         trials = (row.alone, row.added, row.without)
         changes = (number(change) for change in levers.changes(place))
         service, largest = min(trial.service for trial in trials), max(trial.gap or 0.0 for trial in trials)
         gap = "–" if row.alone.gap is None else f"{largest:.1%}"
-        rows.append([row.name, *changes, f"{levers.share(place):.0%}", f"{service:.4f}", gap])
+        books = map(number, levers.account_changes(place)[0].tolist())
+        rows.append([row.name, *changes, *books, f"{levers.share(place):.0%}", f"{service:.4f}", gap])
     mass = levers.network.mass_unit
-    headings = ["lever", *(f"{case} ({mass})" for case in CASES), "all so far", "lowest service", "largest gap"]
+    headings = ["lever", *(f"{case} ({mass})" for case in CASES)]
+    headings += [f"{account.id}, alone ({account.unit})" for account in levers.network.accounts]
+    headings += ["all so far", "lowest service", "largest gap"]
     title = f"λ̄ as usual {number(levers.usual.circularity)} {mass}, with all levers"
     title += f" {number(levers.together.circularity)} {mass}, at most {number(levers.plan.objective)} {mass}"
     return text_table(title, headings, rows, text=["lever"])
@@ -40,6 +46,7 @@ def write_levers(levers: Levers, folder: Path, **options: Any) -> list[Path]:
     """Write table, provenance and chart, all of them or none, and return their paths."""
     mass = levers.network.mass_unit
     figures = [f"circularity ({mass})", f"change ({mass})", "lowest service", f"bound ({mass})", "gap to bound"]
+    figures += [f"change of {account.id} ({account.unit})" for account in levers.network.accounts]
     header = ["lever", "agents", *(f"{case}: {figure}" for case in CASES for figure in figures), "all so far"]
     rows = list(_rows(levers))
     about: dict[str, Any] = {"provenance": provenance(levers.network, **options), "unit": mass}
@@ -55,8 +62,9 @@ def write_levers(levers: Levers, folder: Path, **options: Any) -> list[Path]:
 
 def _rows(levers: Levers) -> Iterator[list[object]]:
     for place, row in enumerate(levers.rows):
-        pairs = zip((row.alone, row.added, row.without), levers.changes(place), strict=True)
-        cells = [cell for trial, change in pairs for cell in _figures(trial, change)]
+        trials, books = (row.alone, row.added, row.without), levers.account_changes(place).tolist()
+        parts = zip(trials, levers.changes(place), books, strict=True)
+        cells = [cell for trial, change, amounts in parts for cell in (*_figures(trial, change), *amounts)]
         yield [row.name, " ".join(row.agents), *cells, levers.share(place)]
 
 
