@@ -46,6 +46,7 @@ from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.dynamics.ledger import Ledger
 from cirl_marl.evaluation.episode_count import concatenation
 from cirl_marl.evaluation.sampling import sample_episodes, sensitivities
+from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.network.disturbances import DisturbanceEffect, Markov
 from cirl_marl.network.uncertainty import Spread, network_of_intervals
 from cirl_marl.network.units import factor
@@ -53,6 +54,7 @@ from cirl_marl.optimum import bound, improve, improve_plan, simulate_plan, smoot
 from cirl_marl.optimum.aims import Aims
 from cirl_marl.optimum.linearised import jacobians, step_program
 from cirl_marl.optimum.program import Programs
+from cirl_marl.report.iamc import write_iamc
 from cirl_marl.report.lever_chart import levers_table, write_levers
 from cirl_marl.report.page_data import page_data
 from cirl_marl.report.report_page import page_of_alternatives
@@ -598,3 +600,35 @@ def test_levers_tell_what_they_add_to_accounts(tmp_path: Path) -> None:
     told = [float(row["alone: change of emissions (t CO2e)"]) for row in rows]
     np.testing.assert_allclose(told, changes[:, 0, 1], rtol=1e-9)
     assert any("emissions, alone" in str(column.header) for column in levers_table(found).columns)
+
+
+def test_years_go_to_the_format_of_scenario_databases(tmp_path: Path) -> None:
+    """Every stock, flow and amount stands there to the last digit, under its region; parts add up to the account."""
+    world, japan = simulate("steel_world", steps=2), simulate("steel_japan", steps=2)
+    with write_iamc(tmp_path / "iamc.csv", [world, japan]).open(encoding="utf-8") as lines:
+        rows = list(csv.DictReader(lines))
+    keys = [(row["Scenario"], row["Region"], row["Variable"]) for row in rows]
+    assert len(set(keys[: -_size(japan)])) == len(keys) - _size(japan)
+    table = {(row["Region"], row["Variable"]): row for row in rows[: -_size(japan)]}
+    network, run = world.network, world.rollout
+    made = table["japan", "Flow|pig_iron_made"]
+    assert made["Unit"] == "kt/yr" and made["Model"].startswith("cirl_marl ")
+    assert [float(made[year]) for year in ("2025", "2026")] == run.flow[
+        :, network.arc_index["japan_pig_iron_made"]
+    ].tolist()
+    total = [float(table["World", "Greenhouse gases"][year]) for year in ("2025", "2026")]
+    parts = [row for (_, variable), row in table.items() if variable.startswith("Greenhouse gases|")]
+    assert {row["Region"] for row in parts} >= {"japan", "china"}
+    np.testing.assert_allclose([sum(float(row[year]) for row in parts) for year in ("2025", "2026")], total, rtol=1e-9)
+    assert rows[-1]["Region"] == "japan" and total == run.bookings[0, 0].tolist()
+    with pytest.raises(CirlError, match="IAMC has calendar years; give"):
+        write_iamc(tmp_path / "no.csv", [simulate(city(), steps=2)])
+    with pytest.raises(CirlError, match="different years"):
+        write_iamc(tmp_path / "no.csv", [japan, simulate("steel_japan", steps=3)])
+
+
+def _size(simulation: Simulation) -> int:
+    network = simulation.network
+    parts = {(simulation.env.ledger.account[e], c) for e, c in enumerate(simulation.env.ledger.compartments)}
+    figures = 1 + len(network.services) + len(network.stores) + len(network.arcs)
+    return figures + len(network.accounts) + len(parts)

@@ -38,6 +38,9 @@ def simulate(
         int | None, typer.Option(min=2, help="Draws of what is uncertain or disturbed, for bands and what causes them.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Directory of CSV and picture; default: here.")] = None,
+    iamc: Annotated[
+        Path | None, typer.Option(help="CSV file of years in the IAMC format, for pyam, to write as well.")
+    ] = None,
     html: common.Html = None,
 ) -> None:
     """Simulate a network under a controller without learning; write a CSV and a picture.
@@ -52,6 +55,8 @@ def simulate(
     """
     controls, page = control or ["neutral"], common.page_for(html)
     if samples is not None:
+        if iamc is not None:
+            raise CirlError("--iamc goes without --samples")
         _sample(network, scenario or [None], controls, steps, 0 if seed is None else seed, samples, out, page)
         return
     from cirl_marl.evaluation.simulations import simulate_alternatives
@@ -65,7 +70,12 @@ def simulate(
         _write_one(folder, files)
     else:
         _write_several(folder, files)
-    for path in common.browser_report(page, found):
+    paths = common.browser_report(page, found)
+    if iamc is not None:
+        from cirl_marl.report.iamc import write_iamc
+
+        paths = [*paths, write_iamc(iamc, found)]
+    for path in paths:
         common.say(f"wrote {path}")
 
 
