@@ -139,7 +139,8 @@ def test_the_best_of_a_round_counts_and_what_it_lacks_is_asked_for(monkeypatch: 
 
     def episode(plan: object) -> SimpleNamespace:
         worth, level = next(tried)
-        return SimpleNamespace(worth=worth, episode_levels=np.full((1, len(found.network.services)), level))
+        levels = np.full((1, len(found.network.services)), level)
+        return SimpleNamespace(worth=worth, episode_levels=levels, accounts=np.empty((1, 0)))
 
     class Step(SimpleNamespace):
         problem, scale, action = None, None, np.arange(found.actions.size).reshape(found.actions.shape)
@@ -148,7 +149,9 @@ def test_the_best_of_a_round_counts_and_what_it_lacks_is_asked_for(monkeypatch: 
             corrected.append(self)
             return Step()
 
-    def program(plan: object, dynamics: object, run: object, demand: Floats, *rest: object) -> SimpleNamespace:
+    def program(
+        plan: object, dynamics: object, run: object, demand: Floats, *rest: object, **budgets: object
+    ) -> SimpleNamespace:
         demands.append(float(demand.max()))
         programs.append(Step())
         return cast(SimpleNamespace, programs[-1])
