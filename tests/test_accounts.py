@@ -122,7 +122,7 @@ def test_every_view_books_the_same(seed: int, nodes: int, arcs: int, lifetimes: 
     np.testing.assert_allclose(run.accounts[0], totals, atol=float(1e-12 * size.max(initial=1.0)))
     np.testing.assert_array_equal(ledger.sums(run.entries.T).T, run.bookings[0].T)
     alone = rollout(MultiAgentVectorEnv(network, num_envs=1), Random(), seed=seed)
-    if np.array_equal(alone.flow, run.flow):  # who acts at random may act otherwise alone
+    if np.array_equal(alone.controls, run.controls):  # who acts at random may act otherwise alone
         np.testing.assert_array_equal(alone.accounts[0], run.accounts[0])
     moved = [
         replace(
