@@ -44,9 +44,10 @@ from cirl_marl.controllers import Neutral, Random
 from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.dynamics.ledger import Ledger
+from cirl_marl.evaluation.compared_quantities import rank_quantities
 from cirl_marl.evaluation.episode_count import concatenation
 from cirl_marl.evaluation.sampling import sample_episodes, sensitivities
-from cirl_marl.evaluation.simulations import Simulation
+from cirl_marl.evaluation.simulations import Simulation, simulate_alternatives
 from cirl_marl.network.disturbances import DisturbanceEffect, Markov
 from cirl_marl.network.uncertainty import Spread, network_of_intervals
 from cirl_marl.network.units import factor
@@ -405,6 +406,7 @@ def test_the_command_line_writes_and_plans(tmp_path: Path) -> None:
     out = ["--out", str(tmp_path / "p.csv")]
     result = CliRunner().invoke(app, ["plan", str(file), *asked, "emissions=100000", *out])
     assert result.exit_code == 0, result.output
+    assert "one more is worth 0 EUR_2023" in " ".join(result.output.split())
     assert "cost ≥" in result.output and "emissions at most 100000 t CO2e" in " ".join(result.output.split())
     result = CliRunner().invoke(app, ["plan", str(file), *asked, "emissions", *out])
     assert "needs ACCOUNT=TOTAL" in str(result.exception)
@@ -632,3 +634,14 @@ def _size(simulation: Simulation) -> int:
     parts = {(simulation.env.ledger.account[e], c) for e, c in enumerate(simulation.env.ledger.compartments)}
     figures = 1 + len(network.services) + len(network.stores) + len(network.arcs)
     return figures + len(network.accounts) + len(parts)
+
+
+def test_small_accounts_differ_beside_large_ones() -> None:
+    """Round-off is that of the account itself: what comes to a few tonnes is not lost beside what comes to billions."""
+    network = city()
+    huge = tuple(replace(a, accounts={**dict(a.accounts), "cost": 1e15}) for a in network.arcs)
+    cases = simulate_alternatives(replace(network, arcs=huge), controls=["neutral", "scripted", "random"], steps=4)
+    ranks = {q.of: q.rank for q in rank_quantities(cases) if q.kind == "account"}
+    totals = [case.rollout.accounts[0] for case in cases]
+    assert np.ptp([total[1] for total in totals]) < 1e-12 * totals[0][0]
+    assert ranks["emissions"] > 0
