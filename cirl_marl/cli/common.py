@@ -104,20 +104,20 @@ Html = Annotated[
 ]
 
 
-def budgets(entries: Sequence[str] | None) -> dict[str, float]:
-    """Read budgets, ACCOUNT=TOTAL each.
+def numbers_by_name(entries: Sequence[str] | None, option: str, form: str) -> dict[str, float]:
+    """Read NAME=NUMBER of each entry of a repeatable option.
 
     Raises:
-        CirlError: naming what is no budget.
+        CirlError: naming the option, the entry, and the ``form`` that it needs.
     """
-    totals = {}
+    numbers = {}
     for entry in entries or ():
-        account, _, total = entry.partition("=")
+        name, _, number = entry.partition("=")
         try:
-            totals[account] = float(total)
+            numbers[name] = float(number)
         except ValueError:
-            raise CirlError(f"--at-most {entry}: needs ACCOUNT=TOTAL with a number") from None
-    return totals
+            raise CirlError(f"{option} {entry}: needs {form}") from None
+    return numbers
 
 
 def plain(error: BaseException) -> str:

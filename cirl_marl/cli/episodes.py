@@ -202,7 +202,7 @@ def plan(
         raise CirlError(f"--out {out}: needs the name of a .csv file")
     page = common.page_for(html)
     options: dict[str, Any] = {"scenario": scenario, "min_service": min_service, "seed": seed, "smooth": smooth}
-    options |= {"aim": aim, "at_most": common.budgets(at_most)}
+    options |= {"aim": aim, "at_most": common.numbers_by_name(at_most, "--at-most", "ACCOUNT=TOTAL with a number")}
     with common.bar("planning") as progress:
         schedule = plans.plan(source, control, **options, progress=progress)
     network = schedule.network
@@ -230,11 +230,4 @@ def _constants(controls: Sequence[str], settings: list[str]) -> dict[str, float]
 
     if settings and not set(controls) & set(SETTABLE):
         raise CirlError(f"--set goes with --control constant or scripted, not with {', '.join(controls)}")
-    constants = {}
-    for setting in settings:
-        agent, _, value = setting.partition("=")
-        try:
-            constants[agent] = float(value)
-        except ValueError:
-            raise CirlError(f"--set {setting}: needs AGENT=VALUE with a number in [-1, 1]") from None
-    return constants
+    return common.numbers_by_name(settings, "--set", "AGENT=VALUE with a number in [-1, 1]")

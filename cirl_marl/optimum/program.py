@@ -214,7 +214,7 @@ class Programs:
         lifetime_rows, lifetime_limits = lifetimes.rows(layout, initial, intervals)
         blocks, limits = [under, from_start, lifetime_rows], [under_to, rows.limits(), lifetime_limits]
         cost, constant = np.tile(-self._weights / steps, steps), self._constant
-        if aims is not None:
+        if aims is not None and (aims.budgets or aims.account is not None):
             totals, beside = account_rows(lifetimes, layout, initial, intervals)
             if aims.account is not None:
                 cost, constant = totals[[aims.account]].toarray()[0], -float(beside[aims.account])

@@ -59,7 +59,6 @@ def _series(simulation: Simulation) -> Iterator[tuple[list[str], Floats]]:
     model, mass = f"cirl_marl {versions()['cirl-marl']}", network.mass_unit
     scenario = f"{network.scenario_name} {simulation.control}"
     own = network.region or WORLD
-    per_year = f"{mass}/yr" if in_years(network.time_unit) else mass
     scale = elapsed_time(2001, 2000, network.time_unit)
     regions = {node: region for region, nodes in network.copies.items() for node in nodes}
 
@@ -81,7 +80,7 @@ def _series(simulation: Simulation) -> Iterator[tuple[list[str], Floats]]:
         yield row(region, f"Stock|{name}", mass), run.stock[:, i]
     for k, arc in enumerate(network.arcs):
         region, name = place(arc.id)
-        yield row(region, f"Flow|{name}", per_year), run.flow[:, k] * scale
+        yield row(region, f"Flow|{name}", f"{mass}/yr"), run.flow[:, k] * scale
     for a, account in enumerate(network.accounts):
         title, unit = account.title or account.id, f"{account.unit}/yr"
         yield row(own, title, unit), run.bookings[0, a]
