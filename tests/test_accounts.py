@@ -644,3 +644,16 @@ def test_small_accounts_differ_beside_large_ones() -> None:
     totals = [case.rollout.accounts[0] for case in cases]
     assert np.ptp([total[1] for total in totals]) < 1e-12 * totals[0][0]
     assert ranks["emissions"] > 0
+
+
+def test_a_smoother_plan_may_book_what_the_last_one_did() -> None:
+    """Where a region is too small to keep a budget again, the program of the nearest actions has a solution."""
+    network = city().with_options(episode={"horizon": 8})
+    least = -bound(network, aim="emissions", min_service=0.9).objective
+    solved = bound(network, min_service=0.9, at_most={"emissions": 1.05 * least})
+    more = replace(solved, actions=np.clip(solved.actions + 0.2, -1.0, 1.0))
+    dynamics, distance = Dynamics(network), smooth.Distance(solved)
+    reference, centre = (smooth._Episode(plan, dynamics) for plan in (solved, more))
+    assert centre.run.accounts[0, 1] > 1.05 * least > reference.run.accounts[0, 1] * 0.999
+    margin = np.zeros_like(reference.run.levels[0])
+    assert smooth._nearer(centre, reference, dynamics, distance, 1e9, 1e-6, margin, restore=False) is not None
