@@ -186,6 +186,8 @@ def random_network(seed: int, nodes: int, arcs: int, *, runge_kutta: bool = Fals
     for i in sorted(dividing):
         to = int(rng.choice([j for j in sinks if j != i]))
         drawn.append(Arc(id=f"rest_{i}", donor=f"node_{i}", recipient=f"node_{to}", law=Law.SHARE))
+    if real:
+        drawn = limited(drawn, [f"node_{i}" for i in range(nodes) if i not in passing], seed, interval * horizon)
     made = [_node(values, i, sets_flow[i], i not in passing, i in dividing) for i in range(nodes)]
     for i in sorted(living):
         made[i] = _living(further, made[i], interval, horizon)
@@ -209,6 +211,19 @@ def random_network(seed: int, nodes: int, arcs: int, *, runge_kutta: bool = Fals
         return network
     step = interval / Dynamics(network).substeps
     return network.with_options(episode={"solver": "rk4", "solver_step": step})
+
+
+def limited(arcs: list[Arc], holders: list[str], seed: int, length: float) -> list[Arc]:
+    """Return arcs of which stocks limit some scheduled flows, at rates that may change in time."""
+    rng, limits = np.random.default_rng([seed, 2]), []
+    for arc in arcs:
+        if arc.law is Law.CONTROLLED and rng.random() < 0.4:
+            rate = float(10 ** rng.uniform(-2, 1))
+            changing = Series(times=(-1.0, length / 2), values=(rate, rate / 2))
+            varying = changing if rng.random() < 0.3 else rate
+            arc = replace(arc, limited_by=str(rng.choice(holders)), capacity_rate=varying)
+        limits.append(arc)
+    return limits
 
 
 class _Values:

@@ -224,7 +224,7 @@ CORRELATION = Correlation(names=("price", "walk", "season"), matrix=((1, 0.8, -0
 def disturbed_networks(draw: st.DrawFn) -> Network:
     """Draw networks with numbers of every kind that are disturbed, and some that are uncertain, too."""
     network = draw(st.from_type(Network))
-    paths = [f"arcs.{arc.id}.{name}" for arc in network.arcs for name in ("rate", "flow", "share")]
+    paths = [f"arcs.{arc.id}.{name}" for arc in network.arcs for name in ("rate", "flow", "share", "capacity_rate")]
     paths += [f"nodes.{node.id}.{name}" for node in network.nodes for name in ("rate", "stretch")]
     paths += [f"{kind}.{part.id}.{CAPACITY}" for kind in ("nodes", "arcs") for part in getattr(network, kind)]
     paths += [f"services.{service.id}.{end}" for service in network.services for end in ("low", "high")]

@@ -288,7 +288,9 @@ def test_random_networks(
 
 def test_the_random_networks_reach_what_matters(make_network: Callable[[int, int, int], Network]) -> None:
     """Among thirty of them are cut flows, valves on scheduled flows, series, several substeps, |net flow|, service."""
-    met = dict.fromkeys(("cut", "valve", "series", "shares", "passing", "changing", "substeps", "abs", "service"), 0)
+    met = dict.fromkeys(
+        ("cut", "valve", "series", "shares", "passing", "changing", "substeps", "abs", "service", "limited"), 0
+    )
     for seed in range(30):
         network = certifiable(make_network(seed, 3 + seed % 6, 4 + seed % 9), 0.3, pulls=False)
         rng = np.random.default_rng(seed)
@@ -302,6 +304,7 @@ def test_the_random_networks_reach_what_matters(make_network: Callable[[int, int
         met["passing"] += len(network.stores) < len(network.nodes)
         met["changing"] += len(np.unique(Admissible.of(network).kinds)) > 1
         met["substeps"] += layout.pieces > 1
+        met["limited"] += any(arc.limited_by for arc in network.arcs)
         met["abs"] += network.objective.net_zero == "abs" and any(imbalance(network, e.flow) for e in played.intervals)
         met["service"] += 0 < played.service < 1
     assert min(met.values()) >= 5, met

@@ -211,7 +211,10 @@ def test_what_cannot_spread_is_refused(written: str, said: str, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("where", "said"),
     [
-        ("arcs.dig.flw", r"can be uncertain or disturbed: rate, share, flow, control, control.high; 'flw'"),
+        (
+            "arcs.dig.flw",
+            r"can be uncertain or disturbed: rate, share, flow, capacity_rate, control, control.high; 'flw'",
+        ),
         ("arcs.dig.control", r"'control' is not given"),
         ("arcs.dg.flow", r"unknown arc 'dg'. Did you mean 'dig'"),
         ("episode.horizon", r"only numbers of nodes, arcs, services can be uncertain"),

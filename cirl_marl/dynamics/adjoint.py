@@ -75,7 +75,9 @@ class Adjoint:
             CirlError: if a node was overdrawn by what its recipients drew; names it and the copy.
         """
         dynamics, stock = self.dynamics, inputs.stock
-        rate = dynamics.rate(inputs.controls, step, inputs.factors)
+        asked_rate = rate = dynamics.rate(inputs.controls, step, inputs.factors)
+        if dynamics.capacities:
+            dynamics.capacities.cut(rate := rate.copy(), stock, step, inputs.factors)
         if dynamics.slots is not None:
             stock = dynamics.slots.shift_slots(stock)
             dynamics.slots.set_outflows(stock, rate)
@@ -95,7 +97,15 @@ class Adjoint:
             rate_adjoint += adjoint
         if dynamics.slots is not None:
             stock_adjoint = dynamics.slots.pull_back(stock_adjoint, rate_adjoint)
-        return IntervalInputs(stock_adjoint, *self.rates.pull_back(inputs.controls, step, inputs.factors, rate_adjoint))
+        by_capacity = None
+        if dynamics.capacities:
+            by_capacity = dynamics.capacities.pull_back(
+                asked_rate, inputs.stock, step, inputs.factors, rate_adjoint, stock_adjoint
+            )
+        by_controls, by_factors = self.rates.pull_back(inputs.controls, step, inputs.factors, rate_adjoint)
+        if by_capacity is not None and by_factors is not None:
+            by_factors += by_capacity
+        return IntervalInputs(stock_adjoint, by_controls, by_factors)
 
     def _drivers(self, stock: Floats, rate: Floats, routes: IntervalRoutes | None) -> list[Floats]:
         """Return what drives the arcs in each term of the series, from the innermost to the mean of the substep."""

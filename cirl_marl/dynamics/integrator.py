@@ -9,6 +9,7 @@ from typing import Annotated
 import numpy as np
 
 from cirl_marl.dynamics.batches import BatchTransport
+from cirl_marl.dynamics.capacities import Capacities
 from cirl_marl.dynamics.inner_physics import InnerPhysics
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.dynamics.routing import IntervalRoutes
@@ -20,6 +21,7 @@ from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Law
 from cirl_marl.network.rowsum import RowSum, disposable
+from cirl_marl.network.series import Series
 
 Transfer = Callable[..., Floats]
 """``(rate, settled) → moved``: mass that a substep moves along each arc; flows in ``settled`` hold, but for NaN."""
@@ -52,6 +54,7 @@ class Dynamics(FlowLaws):
         slots: those of fixed lifetimes; None if there are none.
         inner: the models of the compartments.
         batches: the batch arcs.
+        capacities: cuts scheduled flows to what stocks let them carry.
         physical: whether stocks are kept non-negative.
         substeps: solver steps per control interval.
         taylor: the exact solver, if it is that.
@@ -71,13 +74,15 @@ class Dynamics(FlowLaws):
         self.substep = episode.control_interval / self.substeps
         self.taylor = Taylor(self, self.substep) if episode.solver == "exact" else None
         self.terms = self.taylor.terms if self.taylor is not None else 0
+        self.capacities = Capacities(network, rows, self.factors.ranges)
         self.scheduled = ScheduledFlows(self.staged_network, self.is_scheduled, self.driver, self.substep)
         shape = (rows.masses, len(network.arcs))
         self._outflow_sum = RowSum(rows.donors, np.arange(shape[1]), 1.0, shape)
         self._busiest = int(np.bincount(network.donors, minlength=1).max())
         laws = {arc.law for arc in network.arcs}
         self._heedless = self.physical and bool(laws & {Law.RECIPIENT, Law.COMPARTMENT})
-        self._needs_step = (*self.time_dependent, *(arc.id for arc in network.arcs if arc.law is Law.BATCH))
+        varying = [arc.id for arc in network.arcs if isinstance(arc.capacity_rate, Series)]
+        self._needs_step = (*self.time_dependent, *varying, *(arc.id for arc in network.arcs if arc.law is Law.BATCH))
 
     def advance(
         self,
@@ -107,6 +112,8 @@ class Dynamics(FlowLaws):
                 f"time series and batches depend on it, those of arc '{self._needs_step[0]}' for one"
             )
         rate = actual_rate = self.rate(controls, step, factors)
+        if self.capacities:
+            self.capacities.cut(rate, stock, step, factors)
         if self.slots is not None:
             stock = self.slots.shift_slots(stock)
             self.slots.set_outflows(stock, rate)
@@ -151,7 +158,10 @@ class Dynamics(FlowLaws):
 
     def start_flow(self, stock: Floats, inner: Floats, controls: Floats, factors: Floats | None = None) -> Floats:
         """Return the flows at the start of an episode, cut to what the donors hold, shape (arcs, B), mass/time."""
-        rate = self.rate(controls, np.zeros(stock.shape[1], dtype=np.intp), factors)
+        first = np.zeros(stock.shape[1], dtype=np.intp)
+        rate = self.rate(controls, first, factors)
+        if self.capacities:
+            self.capacities.cut(rate, stock, first, factors)
         if self.slots is not None:
             stock = self.slots.shift_slots(stock)
             self.slots.set_outflows(stock, rate)

@@ -369,6 +369,16 @@ class Arc(Compartment):
             "within the bounds of its control"
         ),
     ] = ""
+    limited_by: Annotated[
+        str,
+        Declaration(
+            "node, such as a plant or a fleet, of whose stock x at the start of an interval a controlled flow is at "
+            "most ``capacity_rate`` · x"
+        ),
+    ] = ""
+    capacity_rate: Annotated[
+        Value, NotNegative("flow that a unit of that stock can carry, 1/time", of="rate", varies=True)
+    ] = 0.0
     weight: Annotated[
         float | None,
         Share("part of that supply, of arcs that make up for the same service; they sum to 1; None: all of it"),

@@ -20,6 +20,7 @@ from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.aims import Aims, account_rows
 from cirl_marl.optimum.constraints import (
     balances,
+    capacity_limits,
     constant_schedules,
     delivery_limits,
     flow_laws,
@@ -158,6 +159,7 @@ class Programs:
             held_arcs = np.flatnonzero(ranges.proportional & (ranges.rate[0] < ranges.rate[1]))
             held_controls(ranges.driver, held_arcs, ranges.neutral_rate[None], ranges.neutral_valve[None], equal)
         delivery_limits(ranges, under_links)
+        capacity_limits(ranges, under_links)
         service_levels(ranges, under)
         decay_rows(ranges, under_links)
         if layout.has_end_flows:

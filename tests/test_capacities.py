@@ -1,0 +1,174 @@
+"""Plants, fleets and other stocks that limit what flows: motion, bounds, plans, gradients, files and messages."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+from cirl_marl import (
+    Account,
+    Arc,
+    Control,
+    ControlKind,
+    Episode,
+    Law,
+    MultiAgentVectorEnv,
+    Network,
+    NetworkError,
+    Node,
+    Role,
+    Series,
+    Service,
+    load_network,
+    parallel_env,
+    write_network,
+)
+from cirl_marl.controllers import Neutral
+from cirl_marl.controllers.rollout import rollout
+from cirl_marl.network.elements import Lifetime
+from cirl_marl.network.uncertainty import Spread
+from cirl_marl.optimum import bound, improve_plan, simulate_plan
+
+ORDER = Control(kind=ControlKind.FLOW, low=0.0, neutral=10.0, high=10.0)
+YEARS = 30
+GROWTH = Series(times=(0.0, 30.0), values=(3.0, 20.0), interpolation="linear")
+TECHNOLOGIES = {"old": (10, 4.0, 100.0, 30.0), "new": (15, 0.0, 300.0, 6.0)}
+"""Life, capacity at the start, what a unit of capacity costs, and what a unit made with it costs."""
+
+
+def power(years: int = YEARS, in_stages: bool = False) -> Network:
+    """Return two technologies, whose capacity is built and retires, that meet a demand together."""
+    nodes = [Node(id="makers", initial=(1e4, 1e4)), Node(id="retired", initial=(0.0, 0.0))]
+    nodes += [Node(id="market", stores=False), Node(id="fuel", initial=(1e5, 1e5), role=Role.NONRENEWABLE_RESERVOIR)]
+    nodes += [Node(id="used", initial=(0.0, 0.0))]
+    arcs = [Arc(id="use", donor="market", recipient="used", law=Law.SHARE)]
+    for name, (life, held, to_build, to_run) in TECHNOLOGIES.items():
+        lifetime = Lifetime(mean=life, deviation=life / 3) if in_stages else Lifetime(mean=life, distribution="fixed")
+        nodes.append(Node(id=name, lifetime=lifetime, initial=(held, held)))
+        arcs += [
+            Arc(id=f"build_{name}", donor="makers", recipient=name, law=Law.CONTROLLED, control=replace(ORDER)),
+            Arc(id=f"retire_{name}", donor=name, recipient="retired", law=Law.SHARE),
+            Arc(
+                id=f"run_{name}",
+                donor="fuel",
+                recipient="market",
+                law=Law.CONTROLLED,
+                control=replace(ORDER, high=30.0),
+                limited_by=name,
+                capacity_rate=1.0,
+            ),
+        ]
+        arcs[-3] = replace(arcs[-3], accounts={"cost": to_build})
+        arcs[-1] = replace(arcs[-1], accounts={"cost": to_run})
+    return Network(
+        name="power",
+        nodes=tuple(nodes),
+        arcs=tuple(arcs),
+        episode=Episode(control_interval=1.0, horizon=years),
+        time_unit="year",
+        services=(Service(id="demand", provider="use", quantity="flow", low=GROWTH),),
+        accounts=(Account(id="cost", unit="EUR_2023", discount=0.05),),
+    )
+
+
+def least_cost(years: int = YEARS, horizon: int | None = None) -> float:
+    """Return the least cost of meeting the demand, by a linear program of builds and outputs written by hand."""
+    names, steps = [*TECHNOLOGIES], years
+    size = len(names) * steps
+    cost, discount = np.zeros(2 * size), 1.05 ** -(np.arange(steps) + 0.5)
+    under, limits = np.zeros((size + steps, 2 * size)), np.zeros(size + steps)
+    demand = power(years).interval_means(GROWTH)
+    for n, (life, held, to_build, to_run) in enumerate(TECHNOLOGIES.values()):
+        for t in range(steps):
+            built, made, row = n * steps + t, size + n * steps + t, n * steps + t
+            cost[built], cost[made] = discount[t] * to_build, discount[t] * to_run
+            under[row, made] = 1.0  # output ≤ what was built in the last life + what is left of the start
+            for s in range(max(0, t - life), t):
+                under[row, n * steps + s] = -1.0
+            limits[row] = held * max(0.0, 1 - t / life)  # its ages are spread evenly over a life
+            under[size + t, made] = -1.0
+    limits[size:] = -demand
+    bounds = [(0, 10.0)] * size + [(0, 30.0)] * size
+    found = linprog(cost, A_ub=under, b_ub=limits, bounds=bounds, method="highs")
+    assert found.success
+    return float(found.fun)
+
+
+def test_least_cost_of_two_technologies_is_that_of_a_program_by_hand() -> None:
+    """Built, aged, retired and run as a linear program of two technologies over 30 years has it, to 1e-6."""
+    found = bound(power(), aim="cost", min_service=1.0)
+    assert found.accounts[0] == pytest.approx(least_cost(), rel=1e-6)
+    run = simulate_plan(improve_plan(found))
+    assert run.episode_levels.min() > 1 - 2e-3
+    assert run.accounts[0, 0] == pytest.approx(least_cost(), rel=3e-3)
+
+
+@pytest.mark.parametrize("in_stages", [False, True])
+def test_what_is_built_serves_from_the_next_interval_on(in_stages: bool) -> None:
+    """Who orders more than there is capacity for gets c·x of the start of the interval, of a life in stages too."""
+    env = MultiAgentVectorEnv(power(in_stages=in_stages), num_envs=1)
+    run = rollout(env, Neutral())
+    stock, flow = run.stock[:, [env.network.node_index[name] for name in TECHNOLOGIES]], run.flow
+    made = flow[:, [env.network.arc_index[f"run_{name}"] for name in TECHNOLOGIES]]
+    start = np.array([[4.0, 0.0], *stock[:-1]])
+    np.testing.assert_allclose(made, np.minimum(start, 10.0), rtol=1e-12, atol=1e-12)
+    assert made[0, 1] == 0.0 < made[1, 1] <= 10.0 == made[-1, 1]
+    assert made[0, 0] == pytest.approx(4.0)
+
+
+def test_agents_see_what_limits_them(tmp_path: Path) -> None:
+    """Who orders sees the stock that limits it, who builds and sees its neighbours what is limited; so do files."""
+    network = power()
+    write_network(network, tmp_path / "power.toml")
+    again = load_network(tmp_path / "power.toml")
+    assert [(arc.limited_by, arc.capacity_rate) for arc in again.arcs] == [
+        (arc.limited_by, arc.capacity_rate) for arc in network.arcs
+    ]
+    names = parallel_env(again, observe="local").unwrapped.observation_names
+    assert "stock of old" in names["run_old"] and "stock of new" not in names["run_old"]
+    near = parallel_env(again, observe="neighbours").unwrapped.observation_names
+    assert "flow of run_new" in near["build_new"]
+
+
+def test_uncertain_capacity_rates_are_drawn() -> None:
+    """What an episode carries is what its own draw lets it carry, and the bound of the draw holds."""
+    spread = Spread(low=0.5, high=1.0, distribution="uniform")
+    network = replace(power(), uncertain={"arcs.run_old.capacity_rate": spread})
+    env = MultiAgentVectorEnv(network, num_envs=2, uncertain=True)
+    run = rollout(env, Neutral())
+    factor = float(env.physical.factors[0, 0])
+    assert 0.5 < factor < 0.99
+    assert run.flow[0, network.arc_index["run_old"]] == pytest.approx(4.0 * factor)
+
+
+@pytest.mark.parametrize(
+    ("arc", "change", "message"),
+    [
+        ("run_old", {"limited_by": "od"}, "limited_by: unknown node with a stock 'od'.*Did you mean 'old'"),
+        ("run_old", {"limited_by": "market"}, "limited_by: unknown node with a stock 'market'"),
+        ("run_old", {"limited_by": ""}, "capacity_rate: no stock limits it; name its node, limited_by"),
+        ("run_old", {"capacity_rate": 0.0}, "limited_by: it needs a capacity_rate above 0"),
+        ("run_old", {"capacity_rate": -1.0}, "capacity_rate -1.0 must be finite and not negative"),
+        (
+            "run_old",
+            {"makes_up_for": "demand"},
+            "limited_by: what makes up for a service has the bounds of its control",
+        ),
+        (
+            "retire_old",
+            {"limited_by": "new", "capacity_rate": 1.0},
+            "needs law 'controlled', not 'share'.*not be linear",
+        ),
+    ],
+)
+def test_capacities_that_cannot_be_meant_are_refused(arc: str, change: dict[str, Any], message: str) -> None:
+    """Named are the arc, the field and what to write."""
+    network = power()
+    arcs = [replace(each, **change) if each.id == arc else each for each in network.arcs]
+    with pytest.raises(NetworkError, match=f"(?s)arc '{arc}'.*{message}"):
+        replace(network, arcs=tuple(arcs))
