@@ -152,10 +152,10 @@ def intervals(network: Network, start: Floats, controls: list[Controls], substep
     stock = start.astype(float)
     for step, held in enumerate(controls):
         rate = np.array([coefficient(network, arc, held, step) for arc in arcs])
-        for k, arc in enumerate(arcs):
+        for limited, arc in enumerate(arcs):
             if arc.limited_by:
                 limit = mean_of(network, arc.capacity_rate, step) * stock[network.node_index[arc.limited_by]]
-                rate[k] = min(rate[k], limit)
+                rate[limited] = min(rate[limited], limit)
         law = np.zeros((len(arcs), nodes))
         for k in np.flatnonzero(~scheduled & ~passed_on):
             law[k, driver[k]] = rate[k]

@@ -18,6 +18,7 @@ from test_optimum import bounded, certifiable, pinned
 from typer.testing import CliRunner
 
 from cirl_marl import (
+    MPC,
     Account,
     Arc,
     CirlError,
@@ -48,7 +49,7 @@ from cirl_marl.evaluation.compared_quantities import rank_quantities
 from cirl_marl.evaluation.episode_count import concatenation
 from cirl_marl.evaluation.sampling import sample_episodes, sensitivities
 from cirl_marl.evaluation.simulations import Simulation, simulate_alternatives
-from cirl_marl.network.disturbances import DisturbanceEffect, Markov
+from cirl_marl.network.disturbances import AutoRegression, DisturbanceEffect, Markov
 from cirl_marl.network.uncertainty import Spread, network_of_intervals
 from cirl_marl.network.units import factor
 from cirl_marl.optimum import bound, improve, improve_plan, simulate_plan, smooth, smooth_plan
@@ -274,13 +275,75 @@ def test_what_cannot_be_asked_for_is_told() -> None:
         ({"aim": "cost", "at_most": {"cost": 1.0}}, "kept as low as can be already"),
         ({"aim": "cost", "service_weight": 1.0}, "service_weight goes with"),
         ({"aim": "cost", "uncertain": True}, "go with a certain future"),
+        ({"aim": {"cost": 1.0, "cots": 2.0}}, "unknown account 'cots'.*Did you mean 'cost'"),
+        ({"aim": {"cost": float("inf")}}, "the weight of 'cost' must be a finite number"),
+        ({"aim": {"circularity": -1.0, "cost": 1.0}}, "the weight of 'circularity' must not be negative"),
+        ({"aim": {"circularity": 0.0}}, "weights of these that are not all 0"),
+        ({"aim": {"circularity": 1.0, "cost": 1.0}, "service_weight": 1.0}, "service_weight goes with"),
     ):
         with pytest.raises(CirlError, match=message):
             bound(network, **options)
     with pytest.raises(CirlError, match="say which service is demanded"):
         plan(network, "optimum", aim="cost")
-    with pytest.raises(CirlError, match="go with --control optimum"):
-        plan(network, "mpc", at_most={"cost": 1.0})
+    with pytest.raises(CirlError, match="go with mpc, scenario_mpc, optimum control, not with best_schedule"):
+        plan(network, "best_schedule", at_most={"cost": 1.0})
+    with pytest.raises(CirlError, match=r"aim.*Did you mean 'cost'"):
+        plan(network, "mpc", aim="costs", min_service=0.9)
+    with pytest.raises(CirlError, match="service_weight goes with the aim"):
+        MPC(aim="cost", service_weight=1.0)
+
+
+def halfway(network: Network) -> float:
+    """Return emissions between the least and those of the best plan, at a service of 0.95."""
+    free, least = (bound(network, aim=aim, min_service=0.95).accounts[1] for aim in ("circularity", "emissions"))
+    return float(free + least) / 2
+
+
+def test_weights_are_prices_of_budgets() -> None:
+    """Who pays the price of a budget per unit has the optimum of who keeps it, but for what the budget is worth."""
+    network = city()
+    kept = bound(network, min_service=0.95, at_most={"emissions": (most := halfway(network))})
+    price = kept.budget_prices["emissions"]
+    assert price > 0
+    paid = bound(network, min_service=0.95, aim={"circularity": 1.0, "emissions": price})
+    assert paid.objective == pytest.approx(kept.objective - price * most, rel=1e-6)
+    assert f"1·λ̄ {-price:+g}·emissions ≤" in str(paid)
+    run = simulate_plan(improve_plan(paid))
+    short = max(0.95 - float(run.episode_levels.min()), 0.0)
+    assert 0 <= short < 1e-3
+    assert paid.aims.value(run) <= float(paid.at(min_service=0.95 - short)) + 1e-9 * abs(paid.objective)
+    assert paid.aims.value(run) == pytest.approx(paid.objective, rel=0.01)
+    dearer = bound(network, min_service=0.95, aim={"cost": 1.0, "emissions": 2e3})
+    assert dearer.objective == pytest.approx(-dearer.accounts @ [1.0, 2e3], rel=1e-6)
+
+
+@pytest.mark.parametrize("horizon", [None, 20, 5])
+def test_mpc_keeps_budgets(horizon: int | None) -> None:
+    """Of all windows, with the service and close to the λ̄ of the bound from the same start."""
+    network = city()
+    most = halfway(network)
+    env = MultiAgentVectorEnv(network, num_envs=1)
+    run = rollout(env, MPC(horizon=horizon, min_service=0.95, at_most={"emissions": most}))
+    found = bound(network, run.start, min_service=0.95, at_most={"emissions": most})
+    assert run.accounts[0, 1] <= most * (1 + 1e-5)
+    assert run.episode_levels.min() >= 0.95 - 2e-3
+    assert -1e-4 <= found.gap(run.episode_circularity)[0] < 0.01
+
+
+def test_mpc_in_a_disturbed_network_charges_for_budgets() -> None:
+    """It books less than without one, at about the service."""
+    network = city().with_options(episode={"horizon": 60})
+    most, path = halfway(network), f"services.{network.services[0].id}.low"
+    disturbances = {"demand": AutoRegression(deviation=0.3, persistence=0.8, low=0.5, high=1.6)}
+    network = replace(network, disturbances=disturbances, disturbed={path: DisturbanceEffect(by="demand")})
+    booked_emissions = {}
+    for futures in (None, 2):
+        for budget in (None, {"emissions": most}):
+            env = MultiAgentVectorEnv(network, num_envs=4)
+            run = rollout(env, MPC(futures=futures, min_service=0.95, at_most=budget))
+            booked_emissions[budget is None] = float(run.accounts[:, 1].mean())
+            assert run.episode_levels.mean() > 0.95 - 0.01
+        assert booked_emissions[False] < 0.85 * booked_emissions[True]
 
 
 @pytest.mark.parametrize(

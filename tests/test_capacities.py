@@ -11,6 +11,7 @@ import pytest
 from scipy.optimize import linprog
 
 from cirl_marl import (
+    MPC,
     Account,
     Arc,
     Control,
@@ -106,6 +107,15 @@ def test_least_cost_of_two_technologies_is_that_of_a_program_by_hand() -> None:
     run = simulate_plan(improve_plan(found))
     assert run.episode_levels.min() > 1 - 2e-3
     assert run.accounts[0, 0] == pytest.approx(least_cost(), rel=3e-3)
+
+
+@pytest.mark.parametrize(("horizon", "regret"), [(None, 1e-6), (5, 5e-3), (2, 5e-3)])
+def test_who_sees_a_window_pays_little_more(horizon: int | None, regret: float) -> None:
+    """What a window leaves is priced by the plan of the episode, so that its cost is close to that of foresight."""
+    env = MultiAgentVectorEnv(power(), num_envs=1)
+    run = rollout(env, MPC(horizon=horizon, replan=1, aim="cost", min_service=1.0))
+    assert run.episode_levels.min() > 1 - 1e-6
+    assert -1e-9 <= run.accounts[0, 0] / least_cost() - 1 < regret
 
 
 @pytest.mark.parametrize("in_stages", [False, True])

@@ -182,8 +182,12 @@ def plan(
         typer.Option(help="Of optimum's plans of equal worth the one with least change; default: unless it is large."),
     ] = None,
     aim: Annotated[
-        str, typer.Option(help="Of optimum: circularity, or the account to keep low beside --min-service.")
-    ] = "circularity",
+        list[str] | None,
+        typer.Option(
+            help="Of mpc and optimum: circularity, or the account to keep low beside --min-service; or NAME=WEIGHT of "
+            "several (repeatable)."
+        ),
+    ] = None,
     at_most: common.AtMost = None,
     html: common.Html = None,
 ) -> None:
@@ -202,7 +206,10 @@ def plan(
         raise CirlError(f"--out {out}: needs the name of a .csv file")
     page = common.page_for(html)
     options: dict[str, Any] = {"scenario": scenario, "min_service": min_service, "seed": seed, "smooth": smooth}
-    options |= {"aim": aim, "at_most": common.numbers_by_name(at_most, "--at-most", "ACCOUNT=TOTAL with a number")}
+    options |= {
+        "aim": _aim(aim),
+        "at_most": common.numbers_by_name(at_most, "--at-most", "ACCOUNT=TOTAL with a number"),
+    }
     with common.bar("planning") as progress:
         schedule = plans.plan(source, control, **options, progress=progress)
     network = schedule.network
@@ -218,6 +225,12 @@ def plan(
     common.console.print(savings_table(schedule))
     _say_lines(str(schedule))
     common.say(f"wrote {', '.join(map(str, (path, *beside)))}")
+
+
+def _aim(entries: list[str] | None) -> str | dict[str, float]:
+    if entries and len(entries) == 1 and "=" not in entries[0]:
+        return entries[0]
+    return common.numbers_by_name(entries, "--aim", "a single NAME, or NAME=WEIGHT with a number") or "circularity"
 
 
 def _say_lines(text: str, prefix: str = "") -> None:

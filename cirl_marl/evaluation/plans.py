@@ -17,7 +17,7 @@ from cirl_marl.errors import CirlError
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Network
 from cirl_marl.network.elements import CIRCULARITY
-from cirl_marl.optimum.aims import budget_texts
+from cirl_marl.optimum.aims import Aim, budget_texts
 from cirl_marl.optimum.bounds import Bound, gap
 from cirl_marl.optimum.open_loop import Optimum
 from cirl_marl.optimum.options import levels_text
@@ -32,7 +32,7 @@ def plan(
     min_service: ArrayLike | None = None,
     seed: int | None = None,
     smooth: bool | None = None,
-    aim: str = CIRCULARITY,
+    aim: Aim = CIRCULARITY,
     at_most: Mapping[str, float] | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Schedule:
@@ -53,8 +53,9 @@ def plan(
         smooth: whether a plan of ``optimum`` is the one nearest to business as usual, with the least change from
             interval to interval, among those of the same λ̄ and services (``optimum.smooth``); None: unless the
             network is large. Of other controllers, and where nothing is proved, plans stay as they are.
-        aim: of ``optimum``: ``circularity``, or the account to keep as low as can be beside ``min_service``.
-        at_most: of ``optimum``: budgets, the highest total of accounts by id, in their units.
+        aim: of ``mpc`` and ``optimum``: ``circularity``, the account to keep as low as can be beside ``min_service``,
+            or weights of these; see ``bound``.
+        at_most: of these: budgets, the highest total of accounts by id, in their units.
         progress: called with the share of the work that is done.
 
     Returns:
@@ -67,8 +68,6 @@ def plan(
     """
     if smooth is not None and control != "optimum":
         raise CirlError("--smooth and --no-smooth go with --control optimum")
-    if (aim != CIRCULARITY or at_most) and control != "optimum":
-        raise CirlError("--aim and --at-most go with --control optimum")
     options = {"min_service": min_service, "smooth": smooth, "aim": aim, "at_most": at_most}
     env, controller = _environment_and_controller(source, control, scenario, options)
     table = schedule(env, controller, seed=seed, progress=progress)
@@ -93,15 +92,11 @@ def _proof(controller: Controller, table: Schedule) -> str:
         limit, demand = limit * network.objective.circularity_scale, "this service"
     elif solution.min_service is not None:
         demand = f"a service of at least {levels_text(network, solution.min_service)}"
-    unit = "λ̄/scale" if solution.service_weight is not None else f"{network.mass_unit} of λ̄"
-    unit = unit if aims.account is None else network.accounts[aims.account].unit
-    prices = (f"one more is worth {price:.4g} {unit}" for price in solution.budget_prices.values())
+    unit = "λ̄/scale" if solution.service_weight is not None else aims.unit(network)
+    prices = (f"one more is worth {price:.4g} {unit}".rstrip() for price in solution.budget_prices.values())
     demand += "".join(f", {text} ({price})" for text, price in zip(budget_texts(network, aims), prices, strict=True))
-    if aims.account is not None:
-        account, share = network.accounts[aims.account], float(gap(limit, aims.value(run)))
-        return f"bound with {demand}: {account.id} ≥ {-limit:.5g} {account.unit}, gap {share:.2%}"
-    share = float(gap(limit, float(run.episode_circularity[0])))
-    return f"bound with {demand}: λ̄ ≤ {limit:.5g} {network.mass_unit}, gap {share:.2%}"
+    share = float(gap(limit, aims.value(run)))
+    return f"bound with {demand}: {aims.statement(network, limit, 5)}, gap {share:.2%}"
 
 
 def _environment_and_controller(

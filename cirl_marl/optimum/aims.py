@@ -1,10 +1,10 @@
-"""What is aimed at beside services: λ̄ or the least of an account, and budgets of others; their rows of a program."""
+"""What is aimed at beside services: λ̄ and totals of accounts, weighed, and budgets; their rows of a program."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import field, replace
 from typing import Annotated
 
 import numpy as np
@@ -19,17 +19,43 @@ from cirl_marl.network.elements import CIRCULARITY
 from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.vintages import Lifetimes
 
+Aim = str | Mapping[str, float]
+"""``circularity``, an account that is kept low, or the weights of λ̄ and of minus the totals of accounts, by name."""
+
 
 @positional_record
 class Aims:
-    """The objective, λ̄ or minus the total of an account, and the accounts whose totals are bounded."""
+    """The objective, w·λ̄ − Σ c_i·(total of account i), and the accounts whose totals are bounded."""
 
-    account: Annotated[int | None, "position of the account that is kept low; None: λ̄ is kept high"] = None
+    circularity: Annotated[float, "w, not negative"] = 1.0
+    charges: Annotated[Mapping[int, float], "c by the position of the account"] = field(default_factory=dict)
     budgets: Annotated[Mapping[int, float], "highest total of accounts, by position"] = field(default_factory=dict)
+
+    @property
+    def is_circular(self) -> bool:
+        """Whether the objective is λ̄."""
+        return self.circularity == 1.0 and not self.charges
+
+    @property
+    def account(self) -> int | None:
+        """Position of the account that alone is kept low; None if there are other aims."""
+        return next(iter(self.charges)) if not self.circularity and [*self.charges.values()] == [1.0] else None
+
+    def weighed(self, circularity: Floats | float, accounts: Floats) -> Floats:
+        """Return the objective, shape (...), of λ̄ and totals of the accounts, shape (accounts, ...)."""
+        objective: Floats = np.asarray(self.circularity * circularity, dtype=np.float64)
+        for account, charge in self.charges.items():
+            objective = objective - charge * accounts[account]
+        return objective
 
     def value(self, run: Rollout) -> float:
         """Return what the first episode of a rollout has of the objective."""
-        return float(run.episode_circularity[0] if self.account is None else -run.accounts[0, self.account])
+        return float(self.weighed(run.episode_circularity[0], run.accounts[0]))
+
+    def size(self, network: Network, accounts: Floats) -> float:
+        """Return how large the objective is, given totals of the accounts, shape (accounts,)."""
+        charged = sum(abs(charge * accounts[account]) for account, charge in self.charges.items())
+        return self.circularity * network.objective.circularity_scale + float(charged)
 
     def totals(self, run: Rollout) -> Floats:
         """Return the totals of the accounts with budgets, shape (budgets,)."""
@@ -42,11 +68,28 @@ class Aims:
 
     def with_lower_budgets(self, excess: Floats) -> Aims:
         """Return the aims with budgets that are lower by ``excess``, shape (budgets,)."""
-        return Aims(self.account, dict(zip(self.budgets, (self.limits - excess).tolist(), strict=True)))
+        return replace(self, budgets=dict(zip(self.budgets, (self.limits - excess).tolist(), strict=True)))
 
     def excess(self, run: Rollout) -> Floats:
         """Return by how much budgets are exceeded, shape (budgets,)."""
         return np.maximum(self.totals(run) - self.limits, 0.0)
+
+    def unit(self, network: Network) -> str:
+        """Return the unit of the objective; empty if several units are weighed."""
+        if self.is_circular:
+            return f"{network.mass_unit} of λ̄"
+        return "" if self.account is None else network.accounts[self.account].unit
+
+    def statement(self, network: Network, limit: float, digits: int) -> str:
+        """Say that no episode has more of the objective than a ``limit``."""
+        if self.is_circular:
+            return f"λ̄ ≤ {limit:.{digits}g} {network.mass_unit}"
+        if self.account is not None:
+            account = network.accounts[self.account]
+            return f"{account.id} ≥ {-limit:.{digits}g} {account.unit}"
+        terms = [f"{self.circularity:g}·λ̄"] if self.circularity else []
+        terms += [f"{-charge:+g}·{network.accounts[account].id}" for account, charge in self.charges.items()]
+        return f"{' '.join(terms)} ≤ {limit:.{digits}g}"
 
 
 NO_AIMS = Aims()
@@ -59,29 +102,67 @@ def budget_texts(network: Network, aims: Aims) -> list[str]:
     return [f"{accounts[i].id} at most {most:.6g} {accounts[i].unit}" for i, most in aims.budgets.items()]
 
 
-def aims_of(network: Network, aim: str, at_most: Mapping[str, float] | None) -> Aims:
+def aims_of(network: Network, aim: Aim, at_most: Mapping[str, float] | None) -> Aims:
     """Return the aims that options of ``bound`` ask for.
 
     Raises:
-        CirlError: for an unknown account, a budget that is no finite number, or one of the account that is kept low.
+        CirlError: for an unknown account, a weight or budget that is no finite number, a negative weight of λ̄, weights
+            that are all 0, or a budget of the account that alone is kept low.
     """
     accounts = [account.id for account in network.accounts]
-    if aim != CIRCULARITY and aim not in accounts:
-        raise CirlError(f"network '{network.name}': aim: {unknown_name('account', aim, [CIRCULARITY, *accounts])}")
+    weights = {aim: 1.0} if isinstance(aim, str) else dict(aim)
+    for name, weight in weights.items():
+        if name not in (CIRCULARITY, *accounts):
+            raise CirlError(f"network '{network.name}': aim: {unknown_name('account', name, [CIRCULARITY, *accounts])}")
+        _check_number(f"aim: the weight of '{name}'", weight)
+    if weights.get(CIRCULARITY, 0.0) < 0:
+        raise CirlError(f"aim: the weight of '{CIRCULARITY}' must not be negative, got {weights[CIRCULARITY]:g}")
+    if not any(weights.values()):
+        raise CirlError(f"aim: give '{CIRCULARITY}', an account, or weights of these that are not all 0, got {aim!r}")
     budgets = {}
     for account, most in (at_most or {}).items():
         if account not in accounts:
             raise CirlError(f"network '{network.name}': at_most: {unknown_name('account', account, accounts)}")
-        if isinstance(most, bool) or not isinstance(most, int | float | np.number) or not math.isfinite(most):
-            raise CirlError(f"at_most: the budget of '{account}' must be a finite number, got {most!r}")
+        _check_number(f"at_most: the budget of '{account}'", most)
         if account == aim:
             raise CirlError(f"at_most: '{account}' is kept as low as can be already; leave out its budget, or the aim")
         budgets[accounts.index(account)] = float(most)
-    return Aims(None if aim == CIRCULARITY else accounts.index(aim), budgets)
+    charges = {accounts.index(name): float(w) for name, w in weights.items() if name != CIRCULARITY and w}
+    return Aims(float(weights.get(CIRCULARITY, 0.0)), charges, budgets)
+
+
+def _check_number(subject: str, number: float) -> None:
+    if isinstance(number, bool) or not isinstance(number, int | float | np.number) or not math.isfinite(number):
+        raise CirlError(f"{subject} must be a finite number, got {number!r}")
+
+
+Rates = tuple[Floats, Floats]
+"""What totals have of mean flows and of mean stocks of some intervals; see ``Ledger.rates``."""
+
+
+def rates_over(network: Network, intervals: range) -> Rates:
+    """Return the rates of the accounts of a network over some intervals."""
+    by_flow, by_stock = Ledger(network).rates()
+    period = slice(intervals.start, intervals.stop)
+    return by_flow[:, period], by_stock[:, period]
+
+
+def totals_over(rates: Rates, flow: Floats, stock: Floats) -> Floats:
+    """Return what each interval books on each account, shape (accounts, intervals).
+
+    Args:
+        rates: over the intervals.
+        flow: mean flows, shape (intervals, arcs), mass/time.
+        stock: at the start and after each interval, shape (intervals + 1, stores), mass.
+    """
+    by_flow, by_stock = rates
+    held = (stock[:-1] + stock[1:]) / 2
+    booked: Floats = np.einsum("atk,tk->at", by_flow, flow) + np.einsum("atk,tk->at", by_stock, held)
+    return booked
 
 
 def account_rows(
-    lifetimes: Lifetimes, layout: Layout, initial: Floats, intervals: range
+    lifetimes: Lifetimes, layout: Layout, initial: Floats, rates: Rates
 ) -> tuple[sparse.csr_array, Floats]:
     """Return what totals are of the variables of a program, exactly, and what they have beside them.
 
@@ -89,13 +170,12 @@ def account_rows(
         lifetimes: of the network.
         layout: of the variables of an interval.
         initial: stocks at the start as the simulator has them, mass.
-        intervals: of the program.
+        rates: over the intervals of the program.
 
     Returns:
         Rows, shape (accounts, variables), and constants, shape (accounts,).
     """
-    network, steps = lifetimes.network, len(intervals)
-    by_flow, by_stock = (rates[:, intervals.start : intervals.stop] for rates in Ledger(network).rates())
+    (by_flow, by_stock), steps = rates, rates[0].shape[1]
     planned = by_stock.reshape(-1, by_stock.shape[2]) @ lifetimes.totals  # some are parts of the stock of a node
     by_stock = planned.reshape(*by_stock.shape[:2], planned.shape[1])
     table = np.zeros((len(by_flow), steps, layout.size))

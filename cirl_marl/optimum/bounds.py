@@ -17,7 +17,7 @@ from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import frozen_record, positional_record
 from cirl_marl.network.elements import CIRCULARITY
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
-from cirl_marl.optimum.aims import NO_AIMS, Aims, account_rows, aims_of, budget_texts
+from cirl_marl.optimum.aims import NO_AIMS, Aim, Aims, account_rows, aims_of, budget_texts, rates_over
 from cirl_marl.optimum.certificate import Certificate, Verification, verify
 from cirl_marl.optimum.draw_proofs import Sampling
 from cirl_marl.optimum.options import (
@@ -59,15 +59,15 @@ class Bound:
     initial: Annotated[Floats, "stocks at the start as the simulator has them, with a lifetime by stage, mass"]
     objective: Annotated[
         float,
-        "the bound, proved by ``verify()``: of λ̄, mass, with a service weight of λ̄/scale + w·service, or of minus the "
-        "total of the account that is kept low",
+        "the bound, proved by ``verify()``: of λ̄, mass, with a service weight of λ̄/scale + w·service, or of what else "
+        "is aimed at, such as minus the total of an account",
     ]
     value: Annotated[float, "the bound on λ̄, or with another objective λ̄ of the plan, mass"]
     service: Annotated[float, "mean service level of the plan"]
     levels: Annotated[Floats, "mean level of each service under the plan, shape (services,)"]
     service_weight: Annotated[float | None, "w; None if the objective is λ̄"]
     min_service: Annotated[Floats | None, "mean level demanded of each service, shape (services,); None for none"]
-    aims: Annotated[Aims, "whether an account is kept low in place of λ̄, and budgets of accounts"]
+    aims: Annotated[Aims, "what is weighed in place of λ̄, and budgets of accounts"]
     accounts: Annotated[Floats, "totals of the accounts under the plan, shape (accounts,)"]
     degree: Annotated[int, "degree of the test polynomials"]
     circularity: Annotated[Floats, "mean of λ over each interval under the plan, shape (steps,), mass"]
@@ -85,10 +85,7 @@ class Bound:
         if self.min_service is not None and self.network.services:
             demand = f", service level at least {levels_text(self.network, self.min_service)}"
         demand += "".join(f", {text}" for text in budget_texts(self.network, self.aims))
-        statement = f"λ̄ ≤ {self.objective:.6g} {mass}{demand}"
-        if self.aims.account is not None:
-            account = self.network.accounts[self.aims.account]
-            statement = f"{account.id} ≥ {-self.objective:.6g} {account.unit}{demand}"
+        statement = self.aims.statement(self.network, self.objective, 6) + demand
         if self.service_weight is not None:
             statement = f"λ̄/scale + {self.service_weight:g}·service ≤ {self.objective:.6g}"
         plan = f"λ̄ = {float(self.circularity.mean()):.6g} {mass} and serves {self.service:.4f}"
@@ -183,7 +180,7 @@ def bound(
     *,
     service_weight: float | None = None,
     min_service: ArrayLike | None = None,
-    aim: str = CIRCULARITY,
+    aim: Aim = CIRCULARITY,
     at_most: Mapping[str, float] | None = None,
     agents: Sequence[str] | None = None,
     scenario: str | None = None,
@@ -214,7 +211,7 @@ def bound(
     *,
     service_weight: float | None = None,
     min_service: ArrayLike | None = None,
-    aim: str = CIRCULARITY,
+    aim: Aim = CIRCULARITY,
     at_most: Mapping[str, float] | None = None,
     agents: Sequence[str] | None = None,
     scenario: str | None = None,
@@ -240,7 +237,8 @@ def bound(
             all in the middle, or with ``uncertain`` drawn as episodes draw them.
         service_weight: w ≥ 0; excludes ``min_service``.
         min_service: in [0, 1], for every service, or one for each, shape (services,).
-        aim: ``circularity``, or the account whose total is kept as low as can be; the bound is then on minus that.
+        aim: ``circularity``; the account whose total is kept as low as can be, the bound being on minus that; or the
+            weights of λ̄ and of minus the totals of accounts, by name.
         at_most: budgets: the highest total of accounts, by id, in their units.
         agents: who acts; None is the network's own choice.
         scenario: scenario of the definition; None is the default.
@@ -268,8 +266,8 @@ def bound(
         sampling = uncertain if isinstance(uncertain, Sampling) else Sampling()
         return uncertain_bound(definition, agents, initial, levels, degree, sampling)
     aims = aims_of(definition, aim, at_most)
-    if service_weight is not None and aim != CIRCULARITY:
-        raise CirlError(f"service_weight goes with the aim '{CIRCULARITY}', not with '{aim}'; demand min_service")
+    if service_weight is not None and not aims.is_circular:
+        raise CirlError(f"service_weight goes with the aim '{CIRCULARITY}', not with {aim!r}; demand min_service")
     admissible = Admissible.of(definition, agents)
     start = starting_stocks(admissible.lifetimes, initial)
     levels = None if min_service is None else demanded_levels(admissible.network, min_service)
@@ -364,14 +362,14 @@ def _solve_bound(
     circularity = plan @ circularity_weights(layout)
     levels = plan[:, layout.level : layout.imbalance]
     lifetimes = admissible.lifetimes
-    totals, beside = account_rows(lifetimes, layout, start, range(len(plan)))
+    totals, beside = account_rows(lifetimes, layout, start, rates_over(lifetimes.network, range(len(plan))))
     stocks = np.concatenate([(lifetimes.start_planned @ start)[None], plan[:, layout.last]])
     return Bound(
         network=lifetimes.network,
         agents=admissible.agents,
         initial=start,
         objective=proof.bound,
-        value=proof.bound if service_weight is None and aims.account is None else float(circularity.mean()),
+        value=proof.bound if service_weight is None and aims.is_circular else float(circularity.mean()),
         service=float(levels.mean()) if levels.size else 1.0,
         levels=levels.mean(axis=0),
         service_weight=service_weight,

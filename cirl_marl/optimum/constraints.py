@@ -148,13 +148,10 @@ def capacity_limits(ranges: IntervalRanges, rows: ProgramRows) -> None:
     x_start is what the stock is at the start of the interval, a node with a lifetime as a whole.
     """
     layout, network = rows.layout, ranges.network
-    columns = layout.flow[layout.moment_column]
-    if layout.has_end_flows:
-        columns = np.concatenate([columns, layout.end_flow[:, None]])
     for k, rate in zip(ranges.limited_arcs.tolist(), ranges.capacity_rate.tolist(), strict=True):
         held = ranges.totals[[network.node_index[network.arcs[k].limited_by]]].toarray()[0]
-        row, stores = rows.add(5, k, np.arange(len(columns))), np.flatnonzero(held)
-        rows.put(row, columns[:, 0] + k, 1.0)
+        row, stores = rows.add(5, k, layout.moments), np.flatnonzero(held)
+        rows.put(row, layout.flow + k, 1.0)
         rows.at_start(row[:, None], 0, stores, -rate * held[stores])
 
 

@@ -122,9 +122,7 @@ def prices(bound: Bound) -> Floats:
 
 def _scale(bound: Bound) -> float:
     """Return the size of the objective, which prices are no less than."""
-    if bound.service_weight is not None:
-        return 1.0
-    return bound.network.objective.circularity_scale if bound.aims.account is None else abs(bound.objective)
+    return 1.0 if bound.service_weight is not None else bound.aims.size(bound.network, bound.accounts)
 
 
 def penalised_objective(bound: Bound, run: Rollout, prices: Floats) -> float:

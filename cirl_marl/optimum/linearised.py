@@ -142,8 +142,7 @@ def step_program(
     low *= 1.0 + margin
     measure, by_stage, imbalances = _measures(bound, dynamics)
     accounts = _account_weights(bound, dynamics)
-    is_circular = bound.aims.account is None
-    weights = _circularity_cost(bound, dynamics) if is_circular else accounts[bound.aims.account]
+    weights = -bound.aims.weighed(-_circularity_cost(bound, dynamics), accounts)
     cost, spent = np.zeros(count), np.zeros((len(limits), count))
     budgets = accounts[[*bound.aims.budgets]]
     state = np.concatenate([stocks, run.flow], axis=1)
@@ -181,10 +180,9 @@ def step_program(
     if bound.service_weight is not None:
         cost /= network.objective.circularity_scale
         cost[columns[:, level:imbalance]] = -bound.service_weight / (steps * max(services, 1))
-    if is_absolute and is_circular:
-        cost[columns[:, imbalance]] += (
-            1.0 / steps / (1.0 if bound.service_weight is None else network.objective.circularity_scale)
-        )
+    if is_absolute:
+        scale = 1.0 if bound.service_weight is None else network.objective.circularity_scale
+        cost[columns[:, imbalance]] += bound.aims.circularity / (steps * scale)
     cost[size * steps :] = price
     problem = LinearProgram(
         cost=cost,

@@ -18,7 +18,7 @@ present states (certainty equivalence), or for several futures drawn from there,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated
 
@@ -30,15 +30,17 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, ControlError, whole_number
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record
+from cirl_marl.network.elements import CIRCULARITY
 from cirl_marl.network.innovations import innovations
 from cirl_marl.network.uncertainty import expected_network
 from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.aims import Aim, aims_of
 from cirl_marl.optimum.draws import Prices
 from cirl_marl.optimum.futures import DrawnFutures
 from cirl_marl.optimum.options import check_margin, check_options, demanded_levels, starting_stocks, with_margin
 from cirl_marl.optimum.solver import Infeasible, SolverFailure
 from cirl_marl.optimum.window_planner import Future, WindowPlanner
-from cirl_marl.optimum.windows import Continuation, WindowPlan, WindowTask
+from cirl_marl.optimum.windows import NOTHING, Continuation, WindowPlan, WindowTask
 
 SERVICE_FIRST = 1000.0
 """Weight of the mean service level, against λ̄/circularity_scale, at which service comes first."""
@@ -61,6 +63,25 @@ class _Plan:
     window: Annotated[WindowPlan | None, "what they are the first of; None if nothing could be planned"]
 
 
+@positional_record
+class _Owed:
+    """What services and budgets ask of some intervals."""
+
+    deficit: Annotated[Floats | None, "least sum of levels, shape (services,); None if nothing is demanded"]
+    limits: Annotated[Floats, "highest totals, in parts of budgets; empty for none"]
+    charges: Annotated[Floats, "of totals, in parts of budgets; empty for none"]
+
+    def without(self, outlook: WindowPlan, after: int, later: float | None) -> _Owed:
+        """Return what is left if intervals of the ``outlook`` from ``after`` on do as it has them.
+
+        Where lacks are priced they deliver, for this sum alone, all that is wanted in ``later`` intervals.
+        """
+        delivered = outlook.levels[after:].sum(axis=0) if later is None else later
+        deficit = None if self.deficit is None else self.deficit - delivered
+        limits = self.limits - outlook.booked[after:].sum(axis=0) if len(self.limits) else self.limits
+        return _Owed(deficit, limits, outlook.charges)
+
+
 class MPC(Planner):
     """Plans again and again from the current stocks; each copy has its own plan.
 
@@ -70,8 +91,11 @@ class MPC(Planner):
     service counts beyond its demand. A service that arcs make up for while nobody acts on them is planned in full, as
     they will supply it.
 
-    In a disturbed network ``min_service`` is of the *expected* levels: what lacks in any interval is charged for at the
-    multipliers of the plan for what is expected, or those of the ``prices``, whatever was delivered before.
+    An ``aim`` and budgets are those of ``bound``: what past intervals booked the planned ones have no more of.
+
+    In a disturbed network ``min_service`` is of the *expected* levels, and budgets of expected totals: what lacks in
+    any interval, and all that is booked on budgeted accounts, is charged for at the multipliers of the plan for what is
+    expected, or those of the ``prices``, whatever was delivered before.
     """
 
     ahead = 0.1  # a first plan takes longer than the later ones, which start from it
@@ -82,6 +106,8 @@ class MPC(Planner):
         horizon: int | None = None,
         min_service: ArrayLike | None = None,
         service_weight: float | None = None,
+        aim: Aim = CIRCULARITY,
+        at_most: Mapping[str, float] | None = None,
         degree: int = 1,
         replan: int | None = None,
         futures: int | None = None,
@@ -96,7 +122,9 @@ class MPC(Planner):
                 WINDOW ahead.
             min_service: mean level demanded, in [0, 1], of every service, or of each, shape (services,); excludes
                 ``service_weight``.
-            service_weight: w ≥ 0.
+            service_weight: w ≥ 0; goes with the aim ``circularity``.
+            aim: see ``bound``.
+            at_most: budgets, likewise.
             degree: degree of the test polynomials; see ``bound``.
             replan: decisions carried out of each plan; None: 4, in a disturbed network 1.
             futures: how many are drawn at every decision in a disturbed network; None: one, in which all is as it is
@@ -112,6 +140,10 @@ class MPC(Planner):
         """
         check_options(service_weight, min_service, degree)
         check_margin(margin)
+        if prices is not None and (aim != CIRCULARITY or at_most):
+            raise CirlError("prices are those of λ̄ and service: leave out aim and at_most")
+        if service_weight is not None and aim != CIRCULARITY:
+            raise CirlError(f"service_weight goes with the aim '{CIRCULARITY}', not with {aim!r}; demand min_service")
         if futures is not None and replan not in (None, 1):
             raise CirlError(f"replan {replan}: of a plan for several futures only the first decision is carried out")
         if prices is not None and (horizon, futures) != (None, None):
@@ -125,7 +157,7 @@ class MPC(Planner):
             raise CirlError(f"horizon {horizon} is shorter than the {replan} decisions carried out of each plan")
         self._options = horizon, replan, futures
         self._prices, self._delay = prices, delay
-        self._margin = margin
+        self._margin, self._aim, self._at_most = margin, aim, at_most
         self._min_service, self._weight, self._degree = min_service, service_weight, degree
 
     def plan(self, env: MultiAgentVectorEnv, seed: int, progress: Callable[[float], None]) -> None:
@@ -136,6 +168,7 @@ class MPC(Planner):
             CirlError: for another number of demanded levels than services.
         """
         network, (horizon, replan, futures) = env.network, self._options
+        self._aims = aims = aims_of(network, self._aim, self._at_most)
         self._levels = None if self._min_service is None else demanded_levels(network, self._min_service)
         self.note, self._env, is_disturbed = "", env, bool(network.disturbed)
         self._horizon = (WINDOW if self._prices is None else 1) if horizon is None and is_disturbed else horizon
@@ -153,7 +186,7 @@ class MPC(Planner):
         self._common_outlook: WindowPlan | None = None
         self._price = np.zeros(0)
         is_short = self._horizon is not None and self._horizon < network.episode.horizon
-        if is_disturbed and (is_short or self._levels is not None):
+        if is_disturbed and (is_short or self._levels is not None or aims.budgets):
             self._common_outlook = outlook = self._expected_outlook()
             multipliers = -outlook.solution.certificate.under[len(outlook.problem.under_to) - len(network.services) :]
             if self._prices is not None:
@@ -204,22 +237,25 @@ class MPC(Planner):
         """Plan the ``window`` of what is left of the episode, the ``rest``."""
         state, steps = self._env.physical, self._env.network.episode.horizon
         deficit = None if self._levels is None else self._levels * steps - state.service[:, copy]
-        if deficit is not None and len(self._price):  # no level is demanded, all that lacks has its price
-            deficit = np.full(len(deficit), float(len(rest)))
+        limits = self._aims.limits - state.accounts[[*self._aims.budgets], copy]
+        limits /= self._planner.futures[0].budget_size
+        owed = _Owed(deficit, limits, NOTHING)
+        if is_priced := self._common_outlook is not None:  # no level is demanded, all that lacks has its price
+            deficit = deficit if deficit is None else np.full(len(deficit), float(len(rest)))
+            owed = _Owed(deficit, NOTHING, self._common_outlook.charges)
         if last is None:
             self._outlooks.pop(copy, None)
         if len(window) == len(rest):
-            return self._plan(copy, window, deficit, last)
+            return self._plan(copy, window, owed, last)
         if self._common_outlook is None and copy not in self._outlooks:
-            self._outlooks[copy] = self._plan(copy, rest, deficit, None, is_outlook=True)
+            self._outlooks[copy] = self._plan(copy, rest, owed, None, is_outlook=True)
         outlook = self._common_outlook or self._outlooks[copy]
         after = window.stop - outlook.task.intervals.start
-        if deficit is not None:
-            deficit = deficit - (steps - window.stop if len(self._price) else outlook.levels[after:].sum(axis=0))
+        owed = owed.without(outlook, after, steps - window.stop if is_priced else None)
         later = outlook.continuation(window)
         if self._prices is not None:
             later = replace(later, costs=self._state_costs(later.costs, copy, window))
-        return self._plan(copy, window, deficit, last or outlook, later)
+        return self._plan(copy, window, owed, last or outlook, later)
 
     def _state_costs(self, costs: Floats, copy: int, window: range) -> Floats:
         """Return the costs of what comes after a window, with prices that follow the states of the disturbances.
@@ -249,7 +285,7 @@ class MPC(Planner):
         self,
         copy: int,
         intervals: range,
-        deficit: Floats | None,
+        owed: _Owed,
         last: WindowPlan | None,
         later: Continuation | None = None,
         *,
@@ -260,37 +296,39 @@ class MPC(Planner):
         Args:
             copy: whose stocks they start from.
             intervals: to be planned.
-            deficit: least sum of the levels of each service over all intervals, shape (services,); None if nothing is
-                demanded.
+            owed: what services and budgets ask of them.
             last: plan before, from whose basis the solver starts.
             later: what comes after; None at the end of the episode.
             is_outlook: whether the multipliers must be good, as they are the prices of later plans.
         """
         stock = self._env.physical.stock[self._env.rows.nodes, copy]
         planner = self._planner if is_outlook or self._drawn is None else self._planners[copy]
-        return self._solve_task(planner, stock, intervals, deficit, last, later, is_outlook=is_outlook)
+        return self._solve_task(planner, stock, intervals, owed, last, later, is_outlook=is_outlook)
 
     def _solve_task(
         self,
         planner: WindowPlanner,
         stock: Floats,
         intervals: range,
-        deficit: Floats | None,
+        owed: _Owed,
         last: WindowPlan | None,
         later: Continuation | None = None,
         *,
         is_outlook: bool = False,
     ) -> WindowPlan:
         """Plan some intervals from a ``stock``, by stage; see ``_plan``."""
-        demand = None
-        if deficit is not None:  # no interval delivers more than all that is wanted
-            demand = np.where(self._full, 1.0, np.clip(deficit / len(intervals), 0.0, 1.0))
+        demand, budgets = None, len(owed.limits)
+        if owed.deficit is not None:  # no interval delivers more than all that is wanted
+            demand = np.where(self._full, 1.0, np.clip(owed.deficit / len(intervals), 0.0, 1.0))
         corrections = None if last is None else last.corrections_of(intervals, len(planner.futures))
-        price = planner.first_price if last is None else last.task.price
-        if len(self._price) and not is_outlook:
+        first_price = planner.first_price[len(self._aims.budgets) - budgets :]
+        price = first_price[: budgets if demand is None else None] if last is None else last.task.price
+        if self._common_outlook is not None:
             price = self._price
         is_redrawn = any(low < high for low, high in (part.ends for part in self._env.network.processes.disturbances))
-        task = WindowTask(stock, intervals, demand, later, price, corrections, is_outlook, is_redrawn)
+        task = WindowTask(
+            stock, intervals, demand, later, price, corrections, is_outlook, is_redrawn, owed.limits, owed.charges
+        )
         return planner.plan(task, last.basis(intervals) if last else None, self._replan)
 
     def _look_ahead(self, copies: Sequence[int]) -> None:
@@ -316,11 +354,12 @@ class MPC(Planner):
                 network = network.with_options(episode={"solver_step": env.dynamics.substep})
         elif self._levels is not None:
             network = with_margin(network, self._margin)
-        return Future(Admissible.of(network, env.agents or None), self._degree, self._weight)
+        return Future(Admissible.of(network, env.agents or None), self._degree, self._weight, aims=self._aims)
 
     def _expected_outlook(self) -> WindowPlan:
         """Return the plan of an episode in which all is as expected, from the middle of the initial ranges."""
         (future,), steps = self._planner.futures, range(self._env.network.episode.horizon)
         deficit = None if self._levels is None else self._levels * len(steps)
+        owed = _Owed(deficit, self._aims.limits / future.budget_size, NOTHING)
         stock = starting_stocks(future.admissible.lifetimes, None)
-        return self._solve_task(self._planner, stock, steps, deficit, None, is_outlook=True)
+        return self._solve_task(self._planner, stock, steps, owed, None, is_outlook=True)

@@ -14,6 +14,7 @@ from cirl_marl.network import Network
 from cirl_marl.network.elements import CIRCULARITY
 from cirl_marl.network.uncertainty import expected_network
 from cirl_marl.optimum.admissible import NoCertificate
+from cirl_marl.optimum.aims import Aim
 from cirl_marl.optimum.bounds import Bound, bound
 from cirl_marl.optimum.cross_entropy import KNOTS, Incumbent, search_each
 from cirl_marl.optimum.improve import improve_plan
@@ -39,7 +40,7 @@ class Optimum(Planner):
         *,
         min_service: ArrayLike | None = None,
         service_weight: float | None = None,
-        aim: str = CIRCULARITY,
+        aim: Aim = CIRCULARITY,
         at_most: Mapping[str, float] | None = None,
         smooth: bool | None = False,
     ) -> None:

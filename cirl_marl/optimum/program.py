@@ -17,7 +17,7 @@ from scipy import sparse
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import frozen_record
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.aims import Aims, account_rows
+from cirl_marl.optimum.aims import Aims, account_rows, rates_over
 from cirl_marl.optimum.constraints import (
     balances,
     capacity_limits,
@@ -193,8 +193,8 @@ class Programs:
             min_service: least mean level of every service, or of each, shape (services,), to which the last rows of G
                 hold it; None if nothing is demanded.
             intervals: of the episode, one after the other; None is all of them.
-            aims: which account is kept low in place of the objective, and budgets, whose rows come before those of
-                services; None: neither.
+            aims: what is weighed in place of the objective, and budgets, whose rows come before those of services;
+                None: neither.
 
         Raises:
             NoCertificate: if recipients may pull more from a node than it holds.
@@ -216,10 +216,10 @@ class Programs:
         lifetime_rows, lifetime_limits = lifetimes.rows(layout, initial, intervals)
         blocks, limits = [under, from_start, lifetime_rows], [under_to, rows.limits(), lifetime_limits]
         cost, constant = np.tile(-self._weights / steps, steps), self._constant
-        if aims is not None and (aims.budgets or aims.account is not None):
-            totals, beside = account_rows(lifetimes, layout, initial, intervals)
-            if aims.account is not None:
-                cost, constant = totals[[aims.account]].toarray()[0], -float(beside[aims.account])
+        if aims is not None and (aims.budgets or aims.charges):
+            totals, beside = account_rows(lifetimes, layout, initial, rates_over(lifetimes.network, intervals))
+            cost = -aims.weighed(-cost, totals.toarray()) if aims.charges else cost
+            constant = float(aims.weighed(constant, beside))
             rows_of_budgets = [*aims.budgets]
             blocks.append(totals[rows_of_budgets])
             limits.append(aims.limits - beside[rows_of_budgets])

@@ -15,6 +15,7 @@ from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network.elements import CIRCULARITY
 
 if TYPE_CHECKING:
+    from cirl_marl.optimum.aims import Aim
     from cirl_marl.optimum.draws import Prices
 
 SETTABLE = ("constant", "scripted")
@@ -26,6 +27,8 @@ UNCERTAIN = ("scenario_mpc", *BLIND, "price_policy")
 CONTROLLERS = ("neutral", "constant", "random", "scripted", "lqr", "mpc", "optimum", *UNCERTAIN)
 PLANNERS = ("mpc", "optimum", *UNCERTAIN)
 """Controllers that plan for a demanded service."""
+WITH_AIMS = ("mpc", "scenario_mpc", "optimum")
+"""Controllers that plan for other aims than λ̄, and keep budgets."""
 TUNABLE = ("scripted", "mpc", *UNCERTAIN)
 """Controllers with a margin on what they aim at."""
 FUTURES = 4
@@ -41,7 +44,7 @@ def named_controller(
     margin: float = 1.0,
     futures: int | None = None,
     prices: Prices | None = None,
-    aim: str = CIRCULARITY,
+    aim: Aim = CIRCULARITY,
     at_most: Mapping[str, float] | None = None,
 ) -> Controller:
     """Return a controller, not yet started.
@@ -55,8 +58,8 @@ def named_controller(
         margin: by what those of TUNABLE multiply what they aim at, or divide what may lack.
         futures: that ``scenario_mpc`` plans for; None: FUTURES.
         prices: of a bound for who does not foresee, which ``price_policy`` needs.
-        aim: of ``optimum``: λ̄, or the account to keep low beside a demanded service; see ``bound``.
-        at_most: its budgets, likewise.
+        aim: of WITH_AIMS: what is aimed at beside a demanded service; see ``bound``.
+        at_most: their budgets, likewise.
 
     Raises:
         CirlError: for an unknown name, or options that the controller does not take.
@@ -71,10 +74,10 @@ def named_controller(
         raise CirlError(f"a margin goes with {', '.join(TUNABLE)} control, not with {name}")
     if futures is not None and name != "scenario_mpc":
         raise CirlError(f"futures go with scenario_mpc control, not with {name}")
-    if (aim != CIRCULARITY or at_most) and name != "optimum":
-        raise CirlError(f"an aim and budgets of accounts go with optimum control, not with {name}")
+    if (aim != CIRCULARITY or at_most) and name not in WITH_AIMS:
+        raise CirlError(f"an aim and budgets of accounts go with {', '.join(WITH_AIMS)} control, not with {name}")
     if aim != CIRCULARITY and min_service is None:
-        raise CirlError(f"aim '{aim}': say which service is demanded beside it, as min_service, or it is least at none")
+        raise CirlError(f"aim {aim!r}: say which service is demanded beside it, as min_service, or it is least at none")
     if name == "optimum":
         from cirl_marl.optimum.mpc import SERVICE_FIRST
         from cirl_marl.optimum.open_loop import Optimum
@@ -83,7 +86,7 @@ def named_controller(
         options: dict[str, Any] = {"min_service": min_service, "service_weight": weight, "smooth": smooth}
         return Optimum(aim=aim, at_most=at_most, **options)
     if name in PLANNERS:
-        return _planner(name, min_service, margin, futures, prices)
+        return _planner(name, min_service, margin, futures, prices, {"aim": aim, "at_most": at_most})
     makers: Mapping[str, Callable[[], Controller]] = {
         "neutral": Neutral,
         "constant": lambda: Constant(constants),
@@ -114,6 +117,7 @@ def _planner(
     margin: float,
     futures: int | None,
     prices: Prices | None,
+    aims: Mapping[str, Any],
 ) -> Controller:
     """Return one of PLANNERS, whose solvers are loaded by those who ask for them."""
     from cirl_marl.optimum.blind import BestConstant, BestSchedule
@@ -129,6 +133,6 @@ def _planner(
             raise CirlError("price_policy control needs the prices of bound(…, uncertain=True), which compare takes")
         return MPC(prices=prices, **demand)
     if name == "scenario_mpc":
-        return MPC(futures=FUTURES if futures is None else futures, **demand)
+        return MPC(futures=FUTURES if futures is None else futures, **aims, **demand)
     blind = dict(zip(BLIND, (BestConstant, BestSchedule), strict=True))
-    return blind[name](**demand) if name in blind else MPC(**demand)
+    return blind[name](**demand) if name in blind else MPC(**aims, **demand)

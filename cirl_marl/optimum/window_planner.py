@@ -9,7 +9,8 @@ actions, and l the lower end of its band, the next program counts as its level a
 for what it plans, q̂': what was missed is raised, what was met better is not paid for twice. Of the plans tried, that
 one is carried out which does best in the simulator.
 
-The price of what services lack rises until no more of them can be had.
+The price of what services lack, and of what budgets are exceeded by, rises until no more can be had. What is booked
+beyond a plan, the next program has that much less of.
 
 Of what nobody foresees several futures may be planned for at once: each has its own rows, what is done in the first
 interval is the same in all, and services count by their mean.
@@ -24,14 +25,16 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from scipy import sparse
 
+from cirl_marl.dynamics.ledger import Ledger
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
+from cirl_marl.optimum.aims import NO_AIMS, Aims, Rates, account_rows, totals_over
 from cirl_marl.optimum.constraints import held_controls
 from cirl_marl.optimum.matrices import IntervalCache, Layout, ProgramRows
 from cirl_marl.optimum.program import Program, Programs
@@ -71,6 +74,7 @@ class WindowTrial:
     value: Annotated[float, "objective reached, less what is left to later intervals"]
     level: Annotated[Floats, "mean level of each service, shape (services,)"]
     correction: Annotated[Correction, "what the plan promised and did not keep"]
+    booked: Annotated[Floats, "on budgeted accounts, in parts of budgets, shape (intervals, budgets)"]
     promised: Annotated[Floats, "levels of the program, shape (intervals, services)"]
 
 
@@ -83,6 +87,7 @@ class Future:
         layout: of the variables of an interval.
         horizon: decisions of an episode, of which the network may have some, or some several times.
         cache: rows of intervals.
+        aims: objective and budgets.
     """
 
     def __init__(
@@ -91,6 +96,7 @@ class Future:
         degree: int,
         service_weight: float | None,
         like: Future | None = None,
+        aims: Aims = NO_AIMS,
     ) -> None:
         """Write down what does not depend on the start; see ``Programs``.
 
@@ -102,6 +108,12 @@ class Future:
         self.horizon: int = network.episode.horizon if like is None else like.horizon
         self.cache: IntervalCache = IntervalCache() if like is None else like.cache
         self._shift = 0
+        self.aims: Aims = aims if like is None else like.aims
+        self._budgets = [*self.aims.budgets]
+        self.budget_size = np.where(self.aims.limits == 0, 1.0, np.abs(self.aims.limits))
+        ledger = Ledger(network)
+        self._undiscounted = ledger.rates(discounted=False) if self.aims.charges or self._budgets else None
+        self._discount: Floats = ledger.discount if like is None else like._discount
         if like is None:
             self._programs = Programs(admissible, degree, service_weight, constant_shares=False)
         else:
@@ -131,7 +143,13 @@ class Future:
         admissible, period = self.admissible, slice(places.start, places.stop)
         problem = self._programs.program(task.stock, None, places)
         layout, steps = problem.layout, len(task.intervals)
-        cost = problem.cost.reshape(steps, -1) * (steps / self.horizon)
+        cost = problem.cost * (steps / self.horizon)
+        if (rates := self._rates(task.intervals)) is not None:
+            totals = account_rows(admissible.lifetimes, layout, task.stock, rates)[0].toarray()
+            cost = -self.aims.weighed(-cost, totals)
+            if len(task.charges):
+                cost += (task.charges / self.budget_size) @ totals[self._budgets]
+        cost = cost.reshape(steps, -1)
         if task.later is not None:
             cost += task.later.costs
         problem = replace(problem, cost=cost.ravel())
@@ -151,6 +169,27 @@ class Future:
             problem = replace(problem, equal=equal, equal_to=equal_to, low=low, under_to=under_to)
         return problem if task.later is None else with_distance(problem, task.later)
 
+    def _rates(self, intervals: range) -> Rates | None:
+        """Return the rates of the accounts, discounted as in the episode; None if nothing is aimed at there."""
+        if self._undiscounted is None:
+            return None
+        places, discount = self._places(intervals), self._discount[:, intervals.start : intervals.stop, None]
+        by_flow, by_stock = (rates[:, places.start : places.stop] * discount for rates in self._undiscounted)
+        return by_flow, by_stock
+
+    def booked(self, problem: Program, task: WindowTask) -> tuple[Any, Floats]:
+        """Return rows of the totals of budgeted accounts over the variables of a program, and what they have beside.
+
+        Both are in parts of the budgets; shapes are (budgets, variables) and (budgets,).
+        """
+        rates = self._rates(task.intervals)
+        if rates is None:
+            return sparse.csr_array((0, len(problem.cost))), np.empty(0)
+        totals, beside = account_rows(self.admissible.lifetimes, problem.layout, task.stock, rates)
+        further = sparse.csr_array((len(self._budgets), len(problem.cost) - totals.shape[1]))
+        rows = sparse.diags_array(1.0 / self.budget_size) @ totals[self._budgets]
+        return sparse.hstack([rows, further], format="csr"), beside[self._budgets] / self.budget_size
+
     def trial(self, problem: Program, plan: Floats, task: WindowTask) -> WindowTrial:
         """Carry a plan out in the simulator.
 
@@ -167,12 +206,24 @@ class Future:
         quantity = np.concatenate([stocks[1:], flows], axis=1) @ self._measure.T
         level = np.divide(quantity, low, out=np.ones_like(low), where=low > 0)
         error = np.where(low > 0, np.clip(self._quantity(problem, plan, variables, low) - level, -1.0, 1.0), 0.0)
-        levels = np.minimum(level, 1.0)
+        levels, booked = np.minimum(level, 1.0), np.zeros((len(intervals), len(self._budgets)))
+        accounts, excess = np.zeros((0, len(intervals))), np.zeros_like(booked)
+        if (rates := self._rates(task.intervals)) is not None:
+            rows = self._simulator.dynamics.rows
+            held = rows.stocks(np.append(stocks, np.ones((len(stocks), 1)), axis=1).T).T
+            accounts = totals_over(rates, flows, held)
+            booked = (accounts[self._budgets] / self.budget_size[:, None]).T
+            planned, beside = self.booked(problem, task)
+            excess += (booked.sum(axis=0) - planned @ plan - beside) / len(intervals)
+        value = self._value(task, flows, stocks[-1], levels, accounts.sum(axis=1))
+        if len(task.charges):
+            value -= float(task.charges @ booked.sum(axis=0))
         return WindowTrial(
             actions,
-            self._value(task, flows, stocks[-1], levels),
+            value,
             levels.mean(axis=0),
-            Correction(error, *self._factors(variables, intervals)),
+            Correction(error, excess, *self._factors(variables, intervals)),
+            booked,
             variables[:, layout.level : layout.imbalance],
         )
 
@@ -198,14 +249,14 @@ class Future:
         quantity: Floats = low * levels - activity
         return np.divide(quantity, low, out=np.zeros_like(low), where=low > 0)
 
-    def _value(self, task: WindowTask, flows: Floats, end: Floats, levels: Floats) -> float:
+    def _value(self, task: WindowTask, flows: Floats, end: Floats, levels: Floats, accounts: Floats) -> float:
         """Return the objective that the simulator reaches, in parts of that of the episode."""
         network, share = self.network, len(flows) / self.horizon
         weights = network.circularity_weights
         per_interval = flows @ weights.sum(axis=0)
         if network.objective.net_zero == "abs":
             per_interval = flows @ weights[0] - np.abs(flows @ weights[1])
-        value = float(per_interval.mean()) * share
+        value = float(self.aims.weighed(per_interval.mean() * share, accounts))
         if self._weight is not None:
             value = value / network.objective.circularity_scale
             value += self._weight * share * float(levels.mean()) if levels.size else 0.0
@@ -229,7 +280,8 @@ class WindowPlanner:
 
     Attributes:
         futures: that are planned for, with the same stocks and disturbances in the first interval of a window.
-        first_price: of a unit of each service that an episode lacks, in the objective, shape (services,).
+        first_price: of each budget by which it is exceeded, and of a unit of each service that an episode lacks, in the
+            objective, shape (budgets + services,).
     """
 
     def __init__(self, futures: Sequence[Future], service_weight: float | None) -> None:
@@ -237,8 +289,15 @@ class WindowPlanner:
         self.futures, self._weight = tuple(futures), service_weight
         network, self._horizon = futures[0].network, futures[0].horizon
         # with a service weight the objective is in parts of the scale
-        self._scale = 1.0 if service_weight is not None else network.objective.circularity_scale
-        self.first_price = np.full(len(network.services), FIRST_PRICE * network.objective.circularity_scale)
+        aims, size = futures[0].aims, network.objective.circularity_scale
+        self._scale = 1.0 if service_weight is not None else size
+        if aims.charges:
+            rates = Ledger(network).rates()
+            scales = [np.array([part.scale for part in parts]) for parts in (network.arcs, network.stores)]
+            accounts = sum((np.abs(rate) @ scale).sum(axis=1) for rate, scale in zip(rates, scales, strict=True))
+            self._scale = size = aims.size(network, np.asarray(accounts))
+        lacking = len(aims.budgets) + len(network.services)
+        self.first_price = np.full(lacking, FIRST_PRICE * size)
 
     def plan(self, task: WindowTask, basis: Basis | None, carried_out: int) -> WindowPlan:
         """Return the best plan that is found, of which the first intervals will be ``carried_out``.
@@ -279,9 +338,9 @@ class WindowPlanner:
                 trial = self._trial(task, basis, rises=0)
             except (Infeasible, SolverFailure):
                 return self._trial(replace(task, corrections=None), None)
-            services = len(self.first_price)
-            is_priced = task.demand is None or task.later is not None or task.is_redrawn
-            if is_priced or trial.solution.plan[len(trial.solution.plan) - services :].max(initial=0.0) <= SHORTFALL:
+            lacking = len(trial.solution.plan) - self._lacking(task)
+            is_priced = task.later is not None or task.is_redrawn
+            if is_priced or trial.solution.plan[lacking:].max(initial=0.0) <= SHORTFALL:
                 return trial
             task, basis = replace(task, corrections=None), None
         return self._trial(task, basis)
@@ -290,17 +349,30 @@ class WindowPlanner:
         """Solve the program of a task and carry its plan out in the simulator."""
         corrections = task.corrections or (None,) * len(self.futures)
         parts = [f.program(task, correction) for f, correction in zip(self.futures, corrections, strict=True)]
-        joint = JointProgram.of(parts, task.demand)
+        pairs = [future.booked(part, task) for future, part in zip(self.futures, parts, strict=True)]
+        limits = task.limits
+        if len(limits):
+            limits = limits - np.mean([beside for _, beside in pairs], axis=0)
+            if task.corrections is not None:
+                limits = limits - np.mean([correction.excess.sum(axis=0) for correction in task.corrections], axis=0)
+        joint = JointProgram.of(parts, task.demand, [rows for rows, _ in pairs], limits)
         task, solution = self._solve(joint.problem, task, basis, rises)
         triples = zip(self.futures, parts, joint.columns, strict=True)
         trials = [future.trial(part, solution.plan[columns], task) for future, part, columns in triples]
         merit, level = float(np.mean([t.value for t in trials])), np.mean([t.level for t in trials], axis=0)
+        booked, budgets = np.mean([t.booked for t in trials], axis=0), len(task.limits)
+        if budgets:
+            merit -= float(task.price[:budgets] @ np.maximum(0.0, booked.sum(axis=0) - task.limits))
         if task.demand is not None:
             share = len(task.intervals) / self._horizon
-            merit -= float(task.price @ np.maximum(0.0, task.demand - level)) * share
+            merit -= float(task.price[budgets:] @ np.maximum(0.0, task.demand - level)) * share
         promised = np.mean([trial.promised for trial in trials], axis=0)
         corrections = tuple(trial.correction for trial in trials)
-        return WindowPlan(task, joint.problem, solution, trials[0].actions, corrections, promised, merit)
+        return WindowPlan(task, joint.problem, solution, trials[0].actions, corrections, promised, booked, merit)
+
+    def _lacking(self, task: WindowTask) -> int:
+        """Return how many budgets and services have a variable for what is exceeded or lacks."""
+        return len(task.limits) + (0 if task.demand is None else len(task.demand))
 
     def _solve(
         self, problem: Program, task: WindowTask, basis: Basis | None, rises: int
@@ -310,40 +382,44 @@ class WindowPlanner:
         if basis is not None and (len(basis.columns), len(basis.rows)) != size:
             basis = None  # of a program with other rows
         label = f"the program of MPC for decisions {task.intervals.start} to {task.intervals.stop - 1}"
-        services, price, least, same_rows = len(self.first_price), task.price, None, False
+        lacking, price, least, same_rows = self._lacking(task), task.price, None, False
+        # a level that lacks counts as the part of the episode that it lacks in
+        share = np.repeat([1.0, len(task.intervals) / self._horizon], [len(task.limits), lacking - len(task.limits)])
         is_rough = task.is_outlook and len(problem.cost) >= LARGE_PROGRAM
         run = partial(solve, label=label, certify=task.is_outlook and not is_rough, is_rough=is_rough)
         shortfall = ROUGH_SHORTFALL if is_rough else SHORTFALL
-        if task.demand is None or not services:
+        if not lacking:
             return task, run(problem, basis)
-        solution = self._all_demanded(problem, run) if is_rough else None
+        solution = self._all_demanded(problem, run, lacking) if is_rough else None
         for rise in range(rises + 1 if solution is None else 0):
-            problem.cost[-services:] = price * (len(task.intervals) / self._horizon)
+            problem.cost[-lacking:] = price * share
             solution = run(problem, basis, same_rows=same_rows, is_near=task.is_redrawn)
-            lack, basis, same_rows = solution.plan[-services:], solution.basis, solution.basis is not None
+            lack, basis, same_rows = solution.plan[-lacking:], solution.basis, solution.basis is not None
             # what comes after was priced beside this price: another one would weigh the two differently
             has_fixed_price = task.later is not None or is_rough or (task.is_redrawn and not task.is_outlook)
             if lack.max() <= shortfall or has_fixed_price or rise == rises:
                 break
             if least is None:
-                only_lack = replace(problem, cost=np.repeat([0.0, 1.0], [len(problem.cost) - services, services]))
-                least = run(only_lack, basis, certify=False, same_rows=same_rows).plan[-services:].sum()
-            if lack.sum() <= least + shortfall * services:
+                only_lack = replace(problem, cost=np.repeat([0.0, 1.0], [len(problem.cost) - lacking, lacking]))
+                least = run(only_lack, basis, certify=False, same_rows=same_rows).plan[-lacking:].sum()
+            if lack.sum() <= least + shortfall * lacking:
                 break
             price = np.where(lack > shortfall, price * RISE, price)
         assert solution is not None
         if task.is_outlook:  # what turns out dearer within windows is not left undone
-            multipliers, lack = -solution.certificate.under[-services:], solution.plan[-services:]
+            multipliers, lack = -solution.certificate.under[-lacking:], solution.plan[-lacking:]
             price = np.where(lack > shortfall, price, np.maximum(price, FIRST_PRICE * multipliers))
         return replace(task, price=price), solution
 
-    def _all_demanded(self, problem: Program, run: Callable[[Program, None], Solution]) -> Solution | None:
-        """Return the optimum of a program in which no service may lack anything; None if there is none.
+    def _all_demanded(
+        self, problem: Program, run: Callable[[Program, None], Solution], lacking: int
+    ) -> Solution | None:
+        """Return the optimum of a program in which no service or budget may lack anything; None if there is none.
 
         Of a large program it is tried first: where prices of service are far above all other costs, HiPO stops early.
         """
-        cost, high, services = problem.cost.copy(), problem.high.copy(), len(self.first_price)
-        cost[-services:], high[-services:] = 0.0, 0.0
+        cost, high = problem.cost.copy(), problem.high.copy()
+        cost[-lacking:], high[-lacking:] = 0.0, 0.0
         try:
             return run(replace(problem, cost=cost, high=high), None)
         except (Infeasible, SolverFailure):

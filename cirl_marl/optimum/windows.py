@@ -9,8 +9,8 @@ Reference: Kerrigan and Maciejowski 2000, UKACC Control (exact penalties in mode
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Annotated
+from dataclasses import field, replace
+from typing import Annotated, Any
 
 import numpy as np
 from scipy import sparse
@@ -20,6 +20,7 @@ from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.program import Program
 from cirl_marl.optimum.solver import Basis, Solution
 
+NOTHING = np.empty(0)
 DISTANCE = 0.1
 """What is charged for stocks at the end of a window that are not those of the plan of the episode, of their price."""
 
@@ -29,12 +30,13 @@ class Correction:
     """What became of a plan in the simulator, by interval."""
 
     error: Annotated[Floats, "(q̂ − q)/l of each service, shape (intervals, services)"]
+    excess: Annotated[Floats, "what was booked beyond the plan, evenly, in parts of budgets, (intervals, budgets)"]
     rate: Annotated[Floats, "flow over what drives it, planned, shape (intervals, arcs), 1/time"]
     valve: Annotated[Floats, "planned valve of each node, shape (intervals, nodes)"]
 
     def of(self, places: Integers) -> Correction:
         """Return that of other intervals, of which each is taken to be like one of these."""
-        return Correction(self.error[places], self.rate[places], self.valve[places])
+        return Correction(self.error[places], self.excess[places], self.rate[places], self.valve[places])
 
 
 @positional_record
@@ -53,12 +55,22 @@ class WindowTask:
     intervals: Annotated[range, "of the episode"]
     demand: Annotated[Floats | None, "mean level of each service over these, shape (services,); None for none"]
     later: Annotated[Continuation | None, "what comes after; None at the end of the episode"]
-    price: Annotated[Floats, "of a unit of each service that the episode lacks, in the objective, shape (services,)"]
+    price: Annotated[
+        Floats,
+        "of each budget by which it is exceeded, in parts of it, and of a unit of each service that the episode lacks, "
+        "shape (budgets + services,)",
+    ]
     corrections: Annotated[
         tuple[Correction, ...] | None, "of a plan before, by future; None: controls may vary within an interval"
     ]
     is_outlook: Annotated[bool, "whether the multipliers must be good, as they are the prices of later plans"] = False
     is_redrawn: Annotated[bool, "whether other futures are planned for than before"] = False
+    limits: Annotated[Floats, "highest totals over these, in parts of budgets; empty for none"] = field(
+        default_factory=lambda: NOTHING
+    )
+    charges: Annotated[Floats, "of the total of each budgeted account, in parts of budgets; empty for none"] = field(
+        default_factory=lambda: NOTHING
+    )
 
 
 @positional_record
@@ -71,7 +83,14 @@ class WindowPlan:
     actions: Annotated[Floats, "normalised, in the first of the futures, shape (intervals, entries)"]
     corrections: Annotated[tuple[Correction, ...], "what became of it in each future"]
     levels: Annotated[Floats, "that the program promises on average, shape (intervals, services)"]
+    booked: Annotated[Floats, "on budgeted accounts, on average, in parts of budgets, shape (intervals, budgets)"]
     merit: Annotated[float, "objective reached there, less what is left to later intervals and what service lacks"]
+
+    @property
+    def charges(self) -> Floats:
+        """What a unit more of each budget is worth to the plan, in parts of it, shape (budgets,)."""
+        multipliers = self.solution.certificate.under[len(self.problem.under_to) - len(self.task.price) :]
+        return np.maximum(-multipliers[: len(self.task.limits)], 0.0)
 
     def basis(self, intervals: range) -> Basis | None:
         """Return the basis from which to plan ``intervals``; None if they are neither as many nor the last of these."""
@@ -91,7 +110,7 @@ class WindowPlan:
         places = np.clip(np.arange(intervals.start, intervals.stop) - own.start, 0, len(own) - 1)
         correction = corrections[0]
         if len(corrections) > 1:
-            parts = ([getattr(c, name) for c in corrections] for name in ("error", "rate", "valve"))
+            parts = ([getattr(c, name) for c in corrections] for name in ("error", "excess", "rate", "valve"))
             correction = Correction(*(np.mean(part, axis=0) for part in parts))
         return (correction.of(places),) * futures
 
@@ -104,9 +123,12 @@ class WindowPlan:
         problem, certificate, layout = self.problem, self.solution.certificate, self.problem.layout
         first, stop = (end - self.task.intervals.start for end in (intervals.start, intervals.stop))
         own = slice(first * layout.size, stop * layout.size)
-        costs = np.zeros(own.stop - own.start)
+        costs, budgets = np.zeros(own.stop - own.start), len(self.task.limits)
+        last = len(problem.under_to) - len(self.task.price) + budgets
         for matrix, multipliers in ((problem.equal, certificate.equal), (problem.under, certificate.under)):
             later = problem.interval_of_rows(matrix) >= stop
+            if matrix is problem.under:  # what is booked has its charges
+                later[last - budgets : last] = False
             costs -= matrix[later][:, own].T @ multipliers[later]
         by_interval = costs.reshape(len(intervals), layout.size)
         if self.solution.basis is None:  # multipliers that are only nearly right would pay for more than is demanded
@@ -161,13 +183,19 @@ class JointProgram:
     columns: Annotated[tuple[Integers, ...], "of the variables of each"]
 
     @classmethod
-    def of(cls, parts: Sequence[Program], demand: Floats | None) -> JointProgram:
+    def of(
+        cls, parts: Sequence[Program], demand: Floats | None, booked: Sequence[Any] = (), limits: Floats = NOTHING
+    ) -> JointProgram:
         """Put programs together whose first intervals are alike.
+
+        The last rows of G hold budgets, then services; what is exceeded or lacks are the last variables.
 
         Args:
             parts: programs without a demand.
-            demand: mean level of each service over intervals and futures, shape (services,), to which the last rows
-                of G hold it; None if nothing is demanded.
+            demand: mean level of each service over intervals and futures, shape (services,); None if nothing is
+                demanded.
+            booked: rows of totals over the variables of each part, shape (budgets, variables), sparse.
+            limits: highest of their means, shape (budgets,); empty for none.
         """
         common, count = parts[0].layout.size, len(parts)
         sizes = [len(part.cost) for part in parts]
@@ -198,6 +226,12 @@ class JointProgram:
                 low=low,
                 high=high,
             )
+        lacking = 0
+        if len(limits):
+            totals = sum((rows @ place / count for rows, place in zip(booked, places, strict=True)))
+            under = sparse.vstack([problem.under, totals], format="csr")
+            problem = replace(problem, under=under, under_to=np.append(problem.under_to, limits))
+            lacking = len(limits)
         if demand is not None and len(demand):
             levels = [level_columns(part) for part in parts]
             weight = -1.0 / (len(levels[0]) // len(demand) * count)
@@ -208,23 +242,25 @@ class JointProgram:
             )
             means.sort_indices()
             under = sparse.vstack([problem.under, means], format="csr")
-            problem = with_lack(replace(problem, under=under, under_to=np.append(problem.under_to, -demand)))
-        return cls(problem, tuple(parts), columns)
+            problem = replace(problem, under=under, under_to=np.append(problem.under_to, -demand))
+            lacking += len(demand)
+        return cls(with_lack(problem, lacking), tuple(parts), columns)
 
 
-def with_lack(problem: Program) -> Program:
-    """Return the program in which the mean level of each service may lack of what is demanded, one variable each."""
-    rows, services = len(problem.under_to), len(problem.layout.network.services)
-    lack = sparse.csr_array(
-        (np.full(services, -1.0), (np.arange(rows - services, rows), np.arange(services))), shape=(rows, services)
-    )
-    empty = sparse.csr_array((len(problem.equal_to), services))
-    most = np.maximum(-problem.under_to[rows - services :], 0.0)
+def with_lack(problem: Program, lacking: int) -> Program:
+    """Return the program in which the last rows of G may lack something, one variable each."""
+    if not lacking:
+        return problem
+    rows, columns = len(problem.under_to), np.arange(lacking)
+    lack = sparse.csr_array((np.full(lacking, -1.0), (rows - lacking + columns, columns)), shape=(rows, lacking))
+    empty = sparse.csr_array((len(problem.equal_to), lacking))
+    last = problem.under[rows - lacking :]
+    most = np.abs(last) @ np.maximum(np.abs(problem.low), np.abs(problem.high)) - problem.under_to[rows - lacking :]
     return replace(
         problem,
-        cost=np.append(problem.cost, np.zeros(services)),
+        cost=np.append(problem.cost, np.zeros(lacking)),
         equal=sparse.hstack([problem.equal, empty], format="csr"),
         under=sparse.hstack([problem.under, lack], format="csr"),
-        low=np.append(problem.low, np.zeros(services)),
-        high=np.append(problem.high, most + 1.0),  # levels are at least −1
+        low=np.append(problem.low, np.zeros(lacking)),
+        high=np.append(problem.high, np.maximum(most, 0.0)),
     )
