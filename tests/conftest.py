@@ -221,7 +221,7 @@ def limited(arcs: list[Arc], holders: list[str], seed: int, length: float) -> li
             rate = float(10 ** rng.uniform(-2, 1))
             changing = Series(times=(-1.0, length / 2), values=(rate, rate / 2))
             varying = changing if rng.random() < 0.3 else rate
-            arc = replace(arc, limited_by=str(rng.choice(holders)), capacity_rate=varying)
+            arc = replace(arc, capacity_node=str(rng.choice(holders)), capacity_rate=varying)
         limits.append(arc)
     return limits
 

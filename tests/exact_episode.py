@@ -153,8 +153,8 @@ def intervals(network: Network, start: Floats, controls: list[Controls], substep
     for step, held in enumerate(controls):
         rate = np.array([coefficient(network, arc, held, step) for arc in arcs])
         for limited, arc in enumerate(arcs):
-            if arc.limited_by:
-                limit = mean_of(network, arc.capacity_rate, step) * stock[network.node_index[arc.limited_by]]
+            if arc.capacity_node:
+                limit = mean_of(network, arc.capacity_rate, step) * stock[network.node_index[arc.capacity_node]]
                 rate[limited] = min(rate[limited], limit)
         law = np.zeros((len(arcs), nodes))
         for k in np.flatnonzero(~scheduled & ~passed_on):

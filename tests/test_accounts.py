@@ -29,15 +29,18 @@ from cirl_marl import (
     Node,
     Role,
     Series,
+    Trained,
     account_front,
     compare,
     gradient,
     levers,
     load_network,
+    load_recipe,
     mo_parallel_env,
     parallel_env,
     plan,
     simulate,
+    train,
     write_network,
 )
 from cirl_marl.cli import app
@@ -328,6 +331,40 @@ def test_mpc_keeps_budgets(horizon: int | None) -> None:
     assert run.accounts[0, 1] <= most * (1 + 1e-5)
     assert run.episode_levels.min() >= 0.95 - 2e-3
     assert -1e-4 <= found.gap(run.episode_circularity)[0] < 0.01
+
+
+@pytest.mark.medium
+def test_learners_keep_budgets(tmp_path: Path) -> None:
+    """By prices that move: independent policies by exact gradients have the service and stay within the budget."""
+    network = city().with_options(episode={"horizon": 60})
+    most, given = halfway(network), load_recipe("exact_gradients")
+    run = given.run.model_copy(update={"min_service": 0.95, "at_most": {"emissions": most}})
+    train(network, given.model_copy(update={"run": run}), steps=300_000, seed=2, directory=tmp_path / "run")
+    played = rollout(MultiAgentVectorEnv(network, num_envs=16), Trained(tmp_path / "run"), seed=7)
+    found = bound(network, min_service=0.95, at_most={"emissions": most})
+    assert played.accounts[:, 1].mean() < most * 1.01
+    assert played.episode_levels.mean() > 0.95 - 5e-3
+    assert played.episode_circularity.mean() > found.objective - 0.05 * abs(found.objective)
+
+
+def test_budgets_of_learners_that_cannot_be_meant_are_refused() -> None:
+    """Without a demanded service, of no account, or charged for in a reward without λ."""
+    network, given = city(), load_recipe("exact_gradients")
+    for changes, message in (
+        ({"min_service": None, "price_rate": 0.0, "at_most": {"cost": 1.0}}, "run.at_most: budgets are kept beside"),
+        ({"at_most": {"cots": 1.0}}, "at_most: unknown account 'cots'.*Did you mean 'cost'"),
+    ):
+        wrong = given.model_copy(update={"run": given.run.model_copy(update=changes)})
+        with pytest.raises(CirlError, match=message):
+            train(network, wrong, steps=1000)
+    with pytest.raises(CirlError, match=r"charges: unknown account 'cots'.*Did you mean 'cost'"):
+        MultiAgentVectorEnv(network, num_envs=1, charges={"cots": 1.0})
+    with pytest.raises(CirlError, match="charges count in rewards with λ, not in 'local'"):
+        MultiAgentVectorEnv(network, num_envs=1, reward="local", charges={"cost": 1.0})
+    with pytest.raises(CirlError, match="charges must be finite numbers"):
+        MultiAgentVectorEnv(network, num_envs=1, charges={"cost": float("nan")})
+    charged = parallel_env(network, reward="team", charges={"cost": 1e-6}).unwrapped
+    assert charged.batch.account_charges[0] == 1e-6
 
 
 def test_mpc_in_a_disturbed_network_charges_for_budgets() -> None:

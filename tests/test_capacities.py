@@ -60,7 +60,7 @@ def power(years: int = YEARS, in_stages: bool = False) -> Network:
                 recipient="market",
                 law=Law.CONTROLLED,
                 control=replace(ORDER, high=30.0),
-                limited_by=name,
+                capacity_node=name,
                 capacity_rate=1.0,
             ),
         ]
@@ -136,8 +136,8 @@ def test_agents_see_what_limits_them(tmp_path: Path) -> None:
     network = power()
     write_network(network, tmp_path / "power.toml")
     again = load_network(tmp_path / "power.toml")
-    assert [(arc.limited_by, arc.capacity_rate) for arc in again.arcs] == [
-        (arc.limited_by, arc.capacity_rate) for arc in network.arcs
+    assert [(arc.capacity_node, arc.capacity_rate) for arc in again.arcs] == [
+        (arc.capacity_node, arc.capacity_rate) for arc in network.arcs
     ]
     names = parallel_env(again, observe="local").unwrapped.observation_names
     assert "stock of old" in names["run_old"] and "stock of new" not in names["run_old"]
@@ -159,19 +159,19 @@ def test_uncertain_capacity_rates_are_drawn() -> None:
 @pytest.mark.parametrize(
     ("arc", "change", "message"),
     [
-        ("run_old", {"limited_by": "od"}, "limited_by: unknown node with a stock 'od'.*Did you mean 'old'"),
-        ("run_old", {"limited_by": "market"}, "limited_by: unknown node with a stock 'market'"),
-        ("run_old", {"limited_by": ""}, "capacity_rate: no stock limits it; name its node, limited_by"),
-        ("run_old", {"capacity_rate": 0.0}, "limited_by: it needs a capacity_rate above 0"),
+        ("run_old", {"capacity_node": "od"}, "capacity_node: unknown node with a stock 'od'.*Did you mean 'old'"),
+        ("run_old", {"capacity_node": "market"}, "capacity_node: unknown node with a stock 'market'"),
+        ("run_old", {"capacity_node": ""}, "capacity_rate: no stock limits it; name its node, capacity_node"),
+        ("run_old", {"capacity_rate": 0.0}, "capacity_node: it needs a capacity_rate above 0"),
         ("run_old", {"capacity_rate": -1.0}, "capacity_rate -1.0 must be finite and not negative"),
         (
             "run_old",
             {"makes_up_for": "demand"},
-            "limited_by: what makes up for a service has the bounds of its control",
+            "capacity_node: what makes up for a service has the bounds of its control",
         ),
         (
             "retire_old",
-            {"limited_by": "new", "capacity_rate": 1.0},
+            {"capacity_node": "new", "capacity_rate": 1.0},
             "needs law 'controlled', not 'share'.*not be linear",
         ),
     ],

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from small_networks import ONE_OF_EACH
+from small_networks import ONE_OF_EACH, booked
 
 from cirl_marl import MultiAgentVectorEnv, RecipeError, load_network, train
 from cirl_marl.environments.derivatives import Derivatives
@@ -34,9 +34,11 @@ def recipe(run: dict[str, Any] | None = None, **learner: Any) -> Recipe:
     )
 
 
-@pytest.mark.parametrize("share", [1.0, 0.5])
-def test_gradients_go_through_the_policies(monkeypatch: pytest.MonkeyPatch, share: float) -> None:
-    """They are those of the mean of λ̄/c plus priced levels over the copies, by every weight of every policy.
+@pytest.mark.parametrize(("share", "budgets"), [(1.0, {}), (0.5, {"emissions": -50.0, "cost": 20.0})])
+def test_gradients_go_through_the_policies(
+    monkeypatch: pytest.MonkeyPatch, share: float, budgets: dict[str, float]
+) -> None:
+    """They are those of the mean over copies of λ̄/c, levels and budgeted totals at their prices, by every weight.
 
     A share of them comes from episodes whose policies see so much of what changed.
     """
@@ -44,6 +46,9 @@ def test_gradients_go_through_the_policies(monkeypatch: pytest.MonkeyPatch, shar
 
     def check(stack: GradientStack, progress_remaining: float) -> None:
         tape, env, prices = stack._tape, stack._env, stack._prices.copy()
+        charges = np.zeros(len(env.ledger.accounts))
+        for place, (account, most) in enumerate(budgets.items()):
+            charges[env.ledger.accounts.index(account)] = stack._budget_prices[1][place] / abs(most)
         monkeypatch.setattr(stack._weights.optimiser, "step", lambda: None)
         ascend(stack, progress_remaining)
         monkeypatch.undo()
@@ -67,7 +72,8 @@ def test_gradients_go_through_the_policies(monkeypatch: pytest.MonkeyPatch, shar
                     inputs = tape[t + 1][1][0] + torch.as_tensor(share * change * tape[t + 1][2], dtype=torch.float32)
             state = env.physical
             value = state.circularity.mean() / env.network.objective.circularity_scale
-            return float(value + prices @ state.service.mean(axis=1)) / len(tape)
+            booked = (state.accounts - tape[0][0].before.accounts).mean(axis=1)
+            return float(value + prices @ state.service.mean(axis=1)) / len(tape) - float(charges @ booked)
 
         largest = float(stack._weights.gradient.abs().max())
         for place in np.random.default_rng(0).integers(0, matrix.numel(), 20):
@@ -84,7 +90,8 @@ def test_gradients_go_through_the_policies(monkeypatch: pytest.MonkeyPatch, shar
 
     monkeypatch.setattr(GradientStack, "_ascend", check)
     monkeypatch.setattr(gradient_ascent, "FEEDBACK", share)
-    train("carbo_net", recipe({"steps": 8}))
+    asked = {"steps": 8, "evaluations": 1, "at_most": budgets, "price_rate": 0.1}
+    train(booked(load_network("carbo_net"), 2), recipe(asked))
     assert len(checked) == 1 and checked[0] > 0
 
 
@@ -93,8 +100,8 @@ def test_each_service_has_a_price(monkeypatch: pytest.MonkeyPatch) -> None:
     move, errors = GradientStack._move_prices, list[np.ndarray]()
     model: list[Any] = []
 
-    def watch(stack: GradientStack, levels: np.ndarray) -> None:
-        move(stack, levels)
+    def watch(stack: GradientStack, levels: np.ndarray, accounts: np.ndarray) -> None:
+        move(stack, levels, accounts)
         doubt = 2 * 1.645 * levels.std(axis=1) / 3  # of nine episodes
         lower = levels.mean(axis=1) - np.maximum(doubt, 0.05 * 0.02)
         errors.append(np.clip((0.98 - lower) / 0.02, -1, 1))

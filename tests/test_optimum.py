@@ -175,7 +175,7 @@ def test_no_episode_with_the_service_exceeds_its_bound(network: Network, interva
 def test_reach(network: Network, interval: float, seed: int) -> None:
     """No simulated stock leaves its bounds, and of scheduled flows that part is delivered that is said to be."""
     network = certifiable(network, interval, pulls=False)
-    free = [replace(arc, limited_by="", capacity_rate=0.0) for arc in network.arcs]
+    free = [replace(arc, capacity_node="", capacity_rate=0.0) for arc in network.arcs]
     single = started(replace(network, arcs=tuple(free)), network.initial[1])
     admissible = Admissible.of(single)
     reached = ComparisonSystem(admissible).reach(

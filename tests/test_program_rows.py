@@ -304,7 +304,7 @@ def test_the_random_networks_reach_what_matters(make_network: Callable[[int, int
         met["passing"] += len(network.stores) < len(network.nodes)
         met["changing"] += len(np.unique(Admissible.of(network).kinds)) > 1
         met["substeps"] += layout.pieces > 1
-        met["limited"] += any(arc.limited_by for arc in network.arcs)
+        met["limited"] += any(arc.capacity_node for arc in network.arcs)
         met["abs"] += network.objective.net_zero == "abs" and any(imbalance(network, e.flow) for e in played.intervals)
         met["service"] += 0 < played.service < 1
     assert min(met.values()) >= 5, met

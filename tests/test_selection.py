@@ -11,15 +11,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from small_networks import ACCOUNTS, booked
 
-from cirl_marl import CirlError, MultiAgentVectorEnv, RecipeError, RunError
+from cirl_marl import CirlError, MultiAgentVectorEnv, RecipeError, RunError, load_network
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.assessment import acting_checkpoint
 from cirl_marl.learners.interface import Trained, resume, train
 from cirl_marl.learners.recipe import LearnerSettings, Recipe, Run
 from cirl_marl.learners.run_directory import RunDirectory
-from cirl_marl.learners.validation import FIRST_SEED, LARGEST_MULTIPLIER, Score, ServiceMultiplier, validation_score
+from cirl_marl.learners.validation import FIRST_SEED, LARGEST_MULTIPLIER, Multipliers, Score, validation_score
 
 HORIZON, STEPS = 6, 96
 
@@ -135,7 +136,7 @@ def test_a_status_of_something_else_is_refused(tmp_path: Path, best: object) -> 
 def test_the_price_moves_by_what_lacks(assured: float, step: float, damping: float) -> None:
     """In closed form, at once in what is paid, and never without end."""
     env = MultiAgentVectorEnv("copper_net", num_envs=2, reward="team", circularity="mean", circularity_weight=0.8)
-    price = ServiceMultiplier(env, 0.99, 0.2, damping)
+    price = Multipliers(env, 0.99, 0.2, damping)
     price.update([0.0])
     price.update([assured])
     weight = env.circularity_weight
@@ -155,18 +156,63 @@ def test_the_price_moves_by_what_lacks(assured: float, step: float, damping: flo
     assert (1 - weight) / weight == pytest.approx(end)
 
 
+@pytest.mark.parametrize("reward", ["team", "mixed", "circularity"])
+def test_each_budget_has_its_price(tmp_path: Path, reward: str) -> None:
+    """What is exceeded becomes dear; all that is booked is paid at its price, also after a resumption."""
+    network = booked(load_network("paper_city").with_options(episode={"horizon": 8}), 3)
+    first, charged = ACCOUNTS[0].id, ACCOUNTS[1].id
+    env, plain, other = (MultiAgentVectorEnv(network, num_envs=2, reward=reward) for _ in range(3))
+    multiplier = Multipliers(env, 0.95, 0.5, 0.0, {charged: -40.0, first: 10.0})
+    multiplier.update([1.0], [10.2, -39.0])
+    scale = network.objective.circularity_scale
+    shares = np.array([0.2 / 10.0, 1.0 / 40.0]) / 0.05
+    expected = 0.1 * np.exp(0.5 * shares) * scale / [10.0, 40.0]
+    np.testing.assert_allclose(env.account_charges, expected, rtol=1e-12)
+    plain.circularity_weight, plain.service_factors = env.circularity_weight, env.service_factors
+    rewards = []
+    for each in (env, plain):
+        each.reset(seed=0)
+        outcome = each.advance(np.zeros((len(each.stack(each.neutral_action)), 2)))
+        rewards.append(outcome.reward)
+        bookings = each.physical.accounts
+    per_mass = 1.0 if reward == "circularity" else env.circularity_weight / scale
+    less = per_mass * 8 * expected @ bookings
+    assert np.abs(less).min() > 0
+    np.testing.assert_allclose(rewards[1] - rewards[0], np.repeat(less[None], len(env.agents), axis=0), rtol=1e-9)
+    multiplier.save(tmp_path)
+    again = Multipliers(other, 0.95, 0.5, 0.0, {charged: -40.0, first: 10.0})
+    again.load(tmp_path)
+    for moved in (multiplier, again):
+        moved.update([1.0], [9.9, -41.0])
+    np.testing.assert_array_equal(other.account_charges, env.account_charges)
+    assert (env.account_charges < expected).all()
+    for _ in range(100):
+        multiplier.update([1.0], [0.0, -100.0])
+    np.testing.assert_allclose(env.account_charges, 1e-4 * scale / np.array([10.0, 40.0]))
+
+
+def test_a_checkpoint_that_exceeds_a_budget_is_no_better() -> None:
+    """Whatever its λ̄; of those that all lack something the one that lacks least is best."""
+    budgets = {"cost": 100.0}
+    kept = Score(-5.0, 1.0, 1.0, 0.0, accounts={"cost": 99.0}).rank(0.9, budgets)
+    over, far = (Score(-1.0, 1.0, 1.0, 0.0, accounts={"cost": cost}).rank(0.9, budgets) for cost in (101.0, 150.0))
+    lacking = Score(-1.0, 0.8, 0.8, 0.0, accounts={"cost": 50.0}).rank(0.9, budgets)
+    assert kept == (True, -5.0)
+    assert kept > over > lacking > far
+
+
 @pytest.mark.parametrize("reward", ["team", "mixed"])
 def test_each_service_has_its_price(tmp_path: Path, reward: str) -> None:
     """What lacks becomes dear, what does not stays; shortfalls are paid at these prices, also after a resumption."""
     env = MultiAgentVectorEnv("carbo_net", num_envs=1, reward=reward, circularity="mean", circularity_weight=0.8)
-    multiplier = ServiceMultiplier(env, 0.99, 0.5, 0.0)
+    multiplier = Multipliers(env, 0.99, 0.5, 0.0)
     for _ in range(4):
         multiplier.update([0.9, 1.0])
     weight, factors = env.circularity_weight, env.service_factors
     np.testing.assert_allclose(factors * (1 - weight) / weight, [0.25 * np.exp(2.0), 0.25])
     multiplier.save(tmp_path)
     other = MultiAgentVectorEnv("carbo_net", num_envs=1, reward=reward, circularity="mean", circularity_weight=0.8)
-    again = ServiceMultiplier(other, 0.99, 0.5, 0.0)
+    again = Multipliers(other, 0.99, 0.5, 0.0)
     again.load(tmp_path)
     again.update([0.9, 1.0])
     multiplier.update([0.9, 1.0])

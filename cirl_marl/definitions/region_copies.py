@@ -18,7 +18,7 @@ REGION = "{region}"
 """What stands for the text of a region in the tables of its copy."""
 NAME_KEYS: Mapping[str, tuple[str, ...]] = {
     "nodes": (),
-    "arcs": ("from", "to", "by", "makes_up_for", "limited_by"),
+    "arcs": ("from", "to", "by", "makes_up_for", "capacity_node"),
     "services": ("provider", "also", "owed_by"),
     "disturbances": ("observed_by",),
 }

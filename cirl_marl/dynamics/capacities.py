@@ -27,12 +27,12 @@ class Capacities:
 
     def __init__(self, network: Network, rows: StateLayout, ranges: Mapping[str, tuple[float, float]]) -> None:
         """Find them in ``network``, which has its lifetimes as stages; ``ranges`` are of all factors."""
-        self.arcs: Integers = np.array([k for k, arc in enumerate(network.arcs) if arc.limited_by], dtype=np.intp)
+        self.arcs: Integers = np.array([k for k, arc in enumerate(network.arcs) if arc.capacity_node], dtype=np.intp)
         arcs = [network.arcs[k] for k in self.arcs.tolist()]
-        nodes = [network.node_index[arc.limited_by] for arc in arcs]
-        held = [(n, int(row)) for n, node in enumerate(nodes) for row in np.atleast_1d(rows.stages.get(node, node))]
-        of, stocks = np.array(held, dtype=np.intp).reshape(-1, 2).T
-        self._held = RowSum(of, stocks, 1.0, (len(arcs), rows.masses))
+        nodes = [network.node_index[arc.capacity_node] for arc in arcs]
+        places = [(n, int(row)) for n, node in enumerate(nodes) for row in np.atleast_1d(rows.stages.get(node, node))]
+        of, stock_rows = np.array(places, dtype=np.intp).reshape(-1, 2).T
+        self._stock_sum = RowSum(of, stock_rows, 1.0, (len(arcs), rows.masses))
         rates = [network.interval_means(arc.capacity_rate) for arc in arcs]
         constant = all(rate.strides[-1] == 0 for rate in rates)
         table = np.array(rates).reshape(len(arcs), network.episode.horizon)
@@ -46,7 +46,7 @@ class Capacities:
 
     def cut(self, rate: Floats, stock: Floats, step: Integers | None, factors: Floats | None) -> None:
         """Cut the rates of arcs, shape (arcs, B), in place, to what ``stock``, shape (masses, B), lets them carry."""
-        limit = self._held(stock) * self._factors(self._rates_in(step), factors)
+        limit = self._stock_sum(stock) * self._factors(self._rates_in(step), factors)
         rate[self.arcs] = np.minimum(rate[self.arcs], limit)
 
     def pull_back(
@@ -68,15 +68,15 @@ class Capacities:
             adjoint: of the rates that were carried; becomes that of those asked for.
             stock_adjoint: to which is added what the limits bring.
         """
-        rates, held = self._rates_in(step), self._held(stock)
-        factored = self._factors(rates, factors)
-        by_limit = np.where(held * factored < rate[self.arcs], adjoint[self.arcs], 0.0)
+        rates, stocks = self._rates_in(step), self._stock_sum(stock)
+        limit_rates = self._factors(rates, factors)
+        by_limit = np.where(stocks * limit_rates < rate[self.arcs], adjoint[self.arcs], 0.0)
         adjoint[self.arcs] -= by_limit
-        self._held.transpose().add_to(stock_adjoint, by_limit * factored)
+        self._stock_sum.transpose().add_to(stock_adjoint, by_limit * limit_rates)
         if factors is None:
             return None
         by_factor = np.zeros_like(factors)
-        self._factors.pull_back(np.broadcast_to(rates, held.shape) * held, by_limit, by_factor)
+        self._factors.pull_back(np.broadcast_to(rates, stocks.shape) * stocks, by_limit, by_factor)
         return by_factor
 
     def _rates_in(self, step: Integers | None) -> Floats:

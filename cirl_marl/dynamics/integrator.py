@@ -81,8 +81,8 @@ class Dynamics(FlowLaws):
         self._busiest = int(np.bincount(network.donors, minlength=1).max())
         laws = {arc.law for arc in network.arcs}
         self._heedless = self.physical and bool(laws & {Law.RECIPIENT, Law.COMPARTMENT})
-        varying = [arc.id for arc in network.arcs if isinstance(arc.capacity_rate, Series)]
-        self._needs_step = (*self.time_dependent, *varying, *(arc.id for arc in network.arcs if arc.law is Law.BATCH))
+        in_steps = [arc.id for arc in network.arcs if arc.law is Law.BATCH or isinstance(arc.capacity_rate, Series)]
+        self._needs_step = (*self.time_dependent, *in_steps)
 
     def advance(
         self,

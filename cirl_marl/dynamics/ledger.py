@@ -110,7 +110,7 @@ class Ledger:
         """Return the amount on each account, shape (accounts, B), of those of entries."""
         return self._by_account(entries)
 
-    def rates(self, *, discounted: bool = True) -> tuple[Floats, Floats]:
+    def rates(self, *, with_discount: bool = True) -> tuple[Floats, Floats]:
         """Return what totals have of mean flows and of mean stocks of each interval.
 
         Shapes are (accounts, horizon, arcs) and (accounts, horizon, stores), in amounts per mass/time and per mass.
@@ -121,5 +121,5 @@ class Ledger:
         rates = np.broadcast_to(self._rates, (len(self._rates), horizon))
         for row, column in zip(rows.tolist(), columns.tolist(), strict=True):
             table[self.account[row], :, column] += rates[row]
-        table *= ((self.discount if discounted else np.ones_like(self.discount)) * self._interval)[:, :, None]
+        table *= ((self.discount if with_discount else np.ones_like(self.discount)) * self._interval)[:, :, None]
         return table[..., :arcs], table[..., arcs:]

@@ -242,7 +242,7 @@ class ObservationLayout:
             yield self._load[agent]
         is_arc, near = isinstance(compartment, Arc), [position]
         if isinstance(compartment, Arc):
-            ends = filter(None, (compartment.donor, compartment.recipient, compartment.limited_by))
+            ends = filter(None, (compartment.donor, compartment.recipient, compartment.capacity_node))
             near = [network.node_index[end] for end in ends]
             yield from near
         arcs = [] if is_arc and mode != "neighbours" else [k for node in near for k in self._incident[node]]
@@ -314,6 +314,6 @@ def _incident_arcs(network: Network) -> list[list[int]]:
     for k, (i, j) in enumerate(zip(network.donors.tolist(), network.recipients.tolist(), strict=True)):
         incident[i].append(k)
         incident[j].append(k)
-        if limit := network.arcs[k].limited_by:
+        if limit := network.arcs[k].capacity_node:
             incident[network.node_index[limit]].append(k)
     return incident

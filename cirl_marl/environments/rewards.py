@@ -203,7 +203,11 @@ class Credit:
         team              w·λ/c − (1 − w)·Σ_s weight_s·shortfall_s over all services
         local_sum         the sum of the local rewards of all compartments, acting or not
 
-    λ is that at the ``end`` of the interval or its ``mean`` over it.
+    λ is that at the ``end`` of the interval or its ``mean`` over it, less T·Σ_a c_a·(what the interval books on account
+    a, discounted), with the ``charges`` c and T intervals: so that their mean is λ̄ − Σ_a c_a·(total of a).
+
+    Attributes:
+        charges: c, shape (accounts,), mass per unit of the account.
     """
 
     def __init__(
@@ -218,6 +222,7 @@ class Credit:
         """Pay ``agents`` by ``mode``; ``measure`` is ``end`` or ``mean``."""
         self.mode, self._measure, self._supply = mode, measure, supply
         self._dynamics, self._scoring, self._agents = dynamics, scoring, tuple(agents)
+        self.charges: Floats = np.zeros(len(dynamics.network.accounts))
         self.weigh(dynamics.network.objective.circularity_weight)
 
     def weigh(self, weight: float) -> None:
@@ -238,12 +243,21 @@ class Credit:
         return network.circularity(transition.flow, at_end), network.circularity(flow, at_start), at_end
 
     def pay(
-        self, end: Floats, mean: Floats, local: Floats, terms: Floats, levels: Floats, state: State, controls: Floats
+        self,
+        end: Floats,
+        mean: Floats,
+        local: Floats,
+        terms: Floats,
+        levels: Floats,
+        state: State,
+        controls: Floats,
+        amounts: Floats,
     ) -> Floats:
         """Return the reward of each agent, shape (agents, B).
 
         It may follow from λ at the ``end`` of the interval and its ``mean`` over it, what ``Scoring`` gives (``local``,
-        ``terms``, ``levels``), the ``state`` at the start and the ``controls`` since.
+        ``terms``, ``levels``), the ``state`` at the start, the ``controls`` since, and the ``amounts`` on
+        accounts, discounted, shape (accounts, B).
 
         Raises:
             CirlError: if the solver cannot follow what would have been, had an agent been neutral; names the agent.
@@ -255,6 +269,8 @@ class Credit:
         credit = end if self._measure == "end" else mean
         if self.mode in ("difference", "mixed_difference"):
             credit = credit - self._counterfactuals(state, controls)
+        if self.charges.any():
+            credit = credit - self._dynamics.network.episode.horizon * (self.charges[:, None] * amounts).sum(axis=0)
         if self.mode in ("mixed", "mixed_difference"):
             reward: Floats = local * self._rest
             reward += credit * self._per_mass

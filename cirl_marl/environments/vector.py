@@ -90,6 +90,7 @@ class MultiAgentVectorEnv:
         observe: str | None = None,
         circularity: str = "end",
         circularity_weight: float | None = None,
+        charges: Mapping[str, float] | None = None,
         horizon: int | None = None,
         uncertain: bool = False,
     ) -> None:
@@ -104,6 +105,7 @@ class MultiAgentVectorEnv:
             observe: ``local``, ``neighbours``, ``full`` or ``model``; None takes the scenario's own.
             circularity: whether the team reward is λ at the ``end`` of the interval or its ``mean`` over it.
             circularity_weight: w in [0, 1], weight of λ in the reward; None takes the definition's.
+            charges: what a unit of each account costs in rewards with λ, mass; see ``Credit``.
             horizon: decisions per episode; None takes the definition's.
             uncertain: whether each copy draws the network's uncertain numbers (``Network.uncertain``) at each reset,
                 after its start and from the same stream. Agents do not see the draw; it is in ``physical.factors``
@@ -142,6 +144,7 @@ class MultiAgentVectorEnv:
         self.scoring = Scoring(self.dynamics, self.layout, self.agents, num_envs)
         self.idle = self.supply.idle(self.agents)
         self._credit = Credit(self.dynamics, self.supply, self.scoring, self.agents, self.reward_mode, moment)
+        self.account_charges = [(charges or {}).get(account, 0.0) for account in self._accounts(charges or {})]
         self.observation_names = self.layout.names
         self._starts = Starts(variant, self.dynamics, num_envs, self.layout.array_order)
         self.rows = self.dynamics.rows
@@ -183,6 +186,28 @@ class MultiAgentVectorEnv:
         if values.shape != self.scoring.service_factors.shape or not (np.isfinite(values) & (values >= 0)).all():
             raise CirlError(f"service_factors must be {len(self._services)} numbers of at least 0, got {factors!r}")
         self.scoring.service_factors = values
+
+    @property
+    def account_charges(self) -> Floats:
+        """What a unit of each account costs in rewards with λ, shape (accounts,), mass; others count from now on."""
+        return self._credit.charges
+
+    @account_charges.setter
+    def account_charges(self, charges: ArrayLike) -> None:
+        values = np.array(charges, dtype=np.float64)
+        if values.shape != self._credit.charges.shape or not np.isfinite(values).all():
+            raise CirlError(f"charges must be finite numbers, one for each account, got {charges!r}")
+        self._credit.charges = values
+
+    def _accounts(self, charges: Mapping[str, float]) -> tuple[str, ...]:
+        """Return the accounts; refuse charges of others, or in rewards that have no λ."""
+        for account in charges:
+            if account not in self.ledger.accounts:
+                fault = unknown_name("account", account, self.ledger.accounts)
+                raise CirlError(f"network '{self.network.name}': charges: {fault}")
+        if any(charges.values()) and self.reward_mode in ("local", "local_sum"):
+            raise CirlError(f"charges count in rewards with λ, not in '{self.reward_mode}'")
+        return self.ledger.accounts
 
     @property
     def is_random(self) -> bool:
@@ -398,7 +423,6 @@ class MultiAgentVectorEnv:
         terms = self.scoring.terms(quantities, levels, dynamics.inner.rewards(state.inner, transition.inner, controls))
         local = self.scoring.local(terms)
         circularity, mean, batch_mass = self._credit.circularity(state, transition, flow)
-        reward = self._credit.pay(circularity, mean, local, terms, levels, state, controls)
         step = state.step + 1
         entries = bookings = accounts = state.accounts
         if self.ledger.accounts:
@@ -406,6 +430,8 @@ class MultiAgentVectorEnv:
             entries = self.ledger.entries(flow, before, after, state.step, factors)
             bookings = self.ledger.sums(entries)
             accounts = accounts + bookings * self.ledger.discount.take(state.step, axis=1)
+        amounts = accounts - state.accounts
+        reward = self._credit.pay(circularity, mean, local, terms, levels, state, controls, amounts)
         totals = (state.circularity + mean, state.service + levels, accounts)
         measures = quantities[self.layout.signals.measures]
         drawn = (state.processes, state.disturbances)

@@ -49,6 +49,9 @@ class Options(Settings):
     observe: Observe | None = None
     circularity: Moment = "end"
     circularity_weight: Annotated[Number, Field(ge=0, le=1)] | None = None
+    charges: dict[StrictStr, Number] = Field(
+        {}, description="what a unit of each account costs in rewards with λ, in units of mass"
+    )
     horizon: Count | None = None
     uncertain: StrictBool = False
     scenario: StrictStr | None = None
@@ -196,11 +199,14 @@ class Run(Settings):
         description="level that every service must reach for a checkpoint to be the best; of those that do, the best "
         "has the highest mean circularity. Left out: the best is paid most",
     )
+    at_most: dict[StrictStr, Number] = Field(
+        {}, description="budgets beside min_service: highest mean totals of accounts, in their units"
+    )
     price_rate: Annotated[Number, Field(ge=0)] = Field(
         0.0,
         description="largest step of the logarithm of the price of a shortfall, each service's own, which moves after "
         "each evaluation until min_service is reached, after each episode with engine gradients; 0: the price stays "
-        "that of circularity_weight",
+        "that of circularity_weight. Budgets have such prices, too",
     )
     price_damping: Annotated[Number, Field(ge=0)] = Field(
         0.0,
@@ -301,6 +307,8 @@ class Recipe(Settings):
         for i, match in enumerate(self.match):
             if match.kind is None and match.role is None and match.agents is None:
                 yield f"match.{i}: fits every agent; give kind, role or agents"
+        if self.run.at_most and not (self.run.price_rate and self.run.min_service is not None):
+            yield "run.at_most: budgets are kept beside min_service by prices that move: give that and a price_rate"
         if self.run.price_rate and (self.run.min_service is None or not self.run.evaluations):
             lacks = "evaluations are 0" if self.run.min_service is not None else "min_service is not given"
             yield f"run.price_rate: moves the price of service after evaluations to reach min_service, but {lacks}"

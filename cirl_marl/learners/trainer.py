@@ -28,8 +28,10 @@ from cirl_marl.learners.run_directory import RunConfig, RunDirectory, TableFile,
 from cirl_marl.learners.stacked.conditions import gradient_obstacle, gradient_stacks, obstacle, stacks
 from cirl_marl.learners.stacked.stack import Stack, StackedPolicies
 from cirl_marl.learners.start import begin_again, begin_from
-from cirl_marl.learners.validation import Score, ServiceMultiplier, validation_score
+from cirl_marl.learners.validation import Multipliers, Score, validation_score
 from cirl_marl.network.declarations import positional_record
+from cirl_marl.network.elements import CIRCULARITY
+from cirl_marl.optimum.aims import aims_of
 
 CHECKPOINTS = 10
 """Checkpoints of a run, evenly spaced."""
@@ -110,7 +112,8 @@ class Training:
         elif checkpoint.name.endswith("-start"):
             for learner, _ in starts:
                 begin_again(checkpoint, learner)
-        self._multiplier = self._service_multiplier()  # its least price is the recipe's, not one that has moved
+        aims_of(env.network, CIRCULARITY, config.recipe.run.at_most)  # refuses budgets of what is no account
+        self._multiplier = self._constraint_multipliers()  # its least price is the recipe's, not one that has moved
         if self._saved_state is not None:
             self.world.load_state_dict(self._saved_state["world"])
         if self._multiplier is not None and checkpoint is not None:
@@ -129,8 +132,8 @@ class Training:
         self._checkpoint_interval = self._shortest_interval or None
         self._appoint_demonstrators()
 
-    def _service_multiplier(self) -> ServiceMultiplier | None:
-        """Return the multipliers of the services if they move."""
+    def _constraint_multipliers(self) -> Multipliers | None:
+        """Return the multipliers of the services and budgets if they move."""
         settings = self.config.recipe.run
         by_evaluations = bool(settings.price_rate) and settings.engine != "gradients"
         if not by_evaluations or settings.min_service is None or not self.env.network.services:
@@ -140,7 +143,8 @@ class Training:
                 f"recipe '{self.config.recipe.name}': run.price_rate: reward '{self.env.reward_mode}' has no price of "
                 f"service that could move; choose {', '.join(CIRCULARITY_REWARDS)}, or a price_rate of 0"
             )
-        return ServiceMultiplier(self.env, settings.min_service, settings.price_rate, settings.price_damping)
+        rates = settings.price_rate, settings.price_damping
+        return Multipliers(self.env, settings.min_service, *rates, settings.at_most)
 
     def keep_in(self, run: RunDirectory) -> None:
         """Keep metrics, logs, checkpoints and the best of them in ``run`` from now on."""
@@ -310,9 +314,9 @@ class Training:
             return
         self._bring_up_to_date()
         score = validation_score(self._validation_env, StackedPolicies(self.learners, self._stacks))
-        target = self.config.recipe.run.min_service
+        target = self.config.recipe.run.min_service, self.config.recipe.run.at_most
         self._last_evaluation = self.joint_steps
-        better = self._best is None or score.rank(target) > self._best.rank(target)
+        better = self._best is None or score.rank(*target) > self._best.rank(*target)
         if better:
             self._best = score
             if self.run is not None:
@@ -322,7 +326,7 @@ class Training:
             row = (score.circularity, score.service, score.service_bound, score.episode_return)
             self._evaluations.append([*steps, *row, self.env.circularity_weight, better])
         if self._multiplier is not None:
-            self._multiplier.update([*score.levels.values()])
+            self._multiplier.update([*score.levels.values()], [*score.accounts.values()])
 
     def _write_policies(self, folder: Path) -> None:
         for learner in self.learners.values():

@@ -1,8 +1,8 @@
 """Validation during a training: episodes of their own choose the checkpoint that counts and move the multiplier.
 
 The last policies of a run are seldom the best ones. Validation episodes, the same each time and unlike those of
-training and of reports, decide which checkpoint acts; a multiplier makes the service that a recipe demands a
-constraint.
+training and of reports, decide which checkpoint acts; multipliers make the service that a recipe demands, and the
+budgets of accounts, constraints.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import field, fields
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -31,6 +32,10 @@ QUANTILE_95 = 1.645
 """Standard errors by which a service must exceed what is demanded, so that it does so in 95 of 100 evaluations."""
 
 
+Rank = tuple[bool, float]
+"""Whether all that is demanded is kept, then how good it is."""
+
+
 @positional_record
 class Score:
     """Figures of a validation."""
@@ -42,17 +47,22 @@ class Score:
     service_bound: Annotated[float, "lower confidence bound of that level, one-sided at 95 %"]
     episode_return: Annotated[float, "mean return of an episode, summed over the agents"]
     levels: Annotated[Mapping[str, float], "such a bound for each service, by id"] = field(default_factory=dict)
+    accounts: Annotated[Mapping[str, float], "upper confidence bound of the total of each account, by id"] = field(
+        default_factory=dict
+    )
 
-    def rank(self, min_service: float | None) -> tuple[bool, float]:
+    def rank(self, min_service: float | None, at_most: Mapping[str, float] = MappingProxyType({})) -> Rank:
         """Return the key by which scores are compared, the higher the better.
 
-        If a level of service is demanded: whether its bound reaches that level, then λ̄ if it does and the bound if
-        not. Otherwise: the return.
+        If a level of service is demanded: whether its bound reaches that level, and all budgets are kept, then λ̄ if so
+        and what lacks most if not, of a budget in parts of it. Otherwise: the return.
         """
         if min_service is None:
             return True, self.episode_return
-        is_served = self.service_bound >= min_service
-        return is_served, self.circularity if is_served else self.service_bound
+        shares = [1.0 + (most - self.accounts[account]) / (abs(most) or 1.0) for account, most in at_most.items()]
+        least = min([self.service_bound, *(min_service * share for share in shares)])
+        is_served = least >= min_service
+        return is_served, self.circularity if is_served else least
 
     def figures(self) -> dict[str, Any]:
         """Return the figures by their names in files."""
@@ -69,8 +79,7 @@ def validation_score(env: MultiAgentVectorEnv, policies: Policies) -> Score:
     """Play the episodes that choose, the same ones each time; ``env`` has a copy for each and is nobody else's."""
     run = rollout(env, policies, seed=FIRST_SEED)
     levels = run.episode_levels
-    spread = levels.std(axis=0, ddof=1) if len(levels) > 1 else np.zeros(levels.shape[1])
-    lower_bounds = levels.mean(axis=0) - QUANTILE_95 * spread / math.sqrt(len(levels))
+    lower_bounds, upper_bounds = _confidence_bound(levels, -1.0), _confidence_bound(run.accounts, 1.0)
     ids = [service.id for service in env.network.services]
     return Score(
         circularity=float(run.episode_circularity.mean()),
@@ -78,7 +87,15 @@ def validation_score(env: MultiAgentVectorEnv, policies: Policies) -> Score:
         service_bound=float(lower_bounds.min(initial=1.0)),
         episode_return=float(run.returns.sum(axis=0).mean()),
         levels=dict(zip(ids, lower_bounds.tolist(), strict=True)),
+        accounts=dict(zip(env.ledger.accounts, upper_bounds.tolist(), strict=True)),
     )
+
+
+def _confidence_bound(values: Floats, side: float) -> Floats:
+    """Return the lower (−1) or upper (1) one-sided bound at 95 % of the mean of episodes, (episodes, n), shape (n,)."""
+    spread = values.std(axis=0, ddof=1) if len(values) > 1 else np.zeros(values.shape[1])
+    bound: Floats = values.mean(axis=0) + side * QUANTILE_95 * spread / math.sqrt(len(values))
+    return bound
 
 
 LARGEST_MULTIPLIER = 1e3
@@ -102,7 +119,31 @@ def price_step(
     return integral, np.clip(integral * np.exp(damping_gain * error), least, LARGEST_MULTIPLIER)
 
 
-class ServiceMultiplier:
+LEAST_BUDGET_PRICE, FIRST_BUDGET_PRICE = 1e-4, 0.1
+"""Price below which that of a budget does not fall, and with which it begins, per circularity scale and its parts."""
+
+
+def budget_levels(budgets: Mapping[int, float], accounts: Floats, min_service: float) -> Floats:
+    """Return totals of accounts as levels of services: min_service where they are just the budget.
+
+    Args:
+        budgets: by position of the account.
+        accounts: totals, shape (accounts, ...).
+        min_service: level that is demanded of services.
+    """
+    excess = [(accounts[account] - most) / (abs(most) or 1.0) for account, most in budgets.items()]
+    return np.asarray(min_service - np.array(excess), dtype=np.float64)
+
+
+def charges_of(env: MultiAgentVectorEnv, budgets: Mapping[int, float], prices: Floats) -> Floats:
+    """Return what a unit of each account costs at the ``prices`` of budgets, shape (accounts,), mass."""
+    charges = np.zeros(len(env.ledger.accounts))
+    for (account, most), price in zip(budgets.items(), prices.tolist(), strict=True):
+        charges[account] = price * env.network.objective.circularity_scale / (abs(most) or 1.0)
+    return charges
+
+
+class Multipliers:
     """The Lagrange multipliers p_s of the demanded services: what a shortfall costs in units of circularity.
 
     The reward is w·λ/c − (1 − w)·Σ_s φ_s·weight_s·shortfall_s, so that p_s = φ_s·(1 − w)/w; the factor φ_s of the
@@ -112,23 +153,43 @@ class ServiceMultiplier:
     what p was at first, where learners that serve more than is demanded would give up at once what takes them long to
     learn. Where one more unit costs about the same over a wide range, they drift through it at any other price, and
     only the damping, which is at once, stops them.
+
+    A budget B of an account has a multiplier p_b as well, per circularity scale c and part of the budget, so that a
+    unit of the account is charged for with p_b·c/|B|; its shortfall is (total − B)/|B|, against the same room.
     """
 
-    def __init__(self, env: MultiAgentVectorEnv, min_service: float, rate: float, damping_gain: float) -> None:
-        """Begin with the weight that ``env`` has."""
+    def __init__(
+        self,
+        env: MultiAgentVectorEnv,
+        min_service: float,
+        rate: float,
+        damping_gain: float,
+        at_most: Mapping[str, float] = MappingProxyType({}),
+    ) -> None:
+        """Begin with the weight that ``env`` has; ``at_most`` are the budgets of accounts, by id."""
         self._env, self._min_service, self._rate, self._damping_gain = env, min_service, rate, damping_gain
+        self._budgets = {env.ledger.accounts.index(account): most for account, most in at_most.items()}
+        self._budget_integrals: Floats = np.full(len(self._budgets), FIRST_BUDGET_PRICE)
         weight = max(env.circularity_weight, 1.0 / (1.0 + LARGEST_MULTIPLIER))
         self._least = (1.0 - weight) / weight
         self._integrals: Floats = np.full(len(env.network.services), self._least)
 
-    def update(self, levels: ArrayLike) -> None:
-        """Move the multipliers after a validation that assures ``levels``, shape (services,)."""
+    def update(self, levels: ArrayLike, accounts: ArrayLike = ()) -> None:
+        """Move the multipliers after a validation.
+
+        It assures ``levels``, shape (services,), and totals of at most ``accounts``, shape (accounts,).
+        """
         self._integrals, prices = price_step(
             self._integrals, levels, self._min_service, self._rate, self._damping_gain, least=self._least
         )
         highest = float(prices.max())
         self._env.circularity_weight = 1.0 / (1.0 + highest)
         self._env.service_factors = prices / highest if highest else np.ones_like(prices)
+        if self._budgets:
+            levels_of_budgets = budget_levels(self._budgets, np.asarray(accounts, dtype=np.float64), self._min_service)
+            options = (self._min_service, self._rate, self._damping_gain, LEAST_BUDGET_PRICE)
+            self._budget_integrals, budget_prices = price_step(self._budget_integrals, levels_of_budgets, *options)
+            self._env.account_charges = charges_of(self._env, self._budgets, budget_prices)
 
     def save(self, folder: Path) -> None:
         """Write the weight, the factors and the integral parts to a checkpoint."""
@@ -137,6 +198,9 @@ class ServiceMultiplier:
             "service_factors": self._env.service_factors.tolist(),
             "lasting_price": self._integrals.tolist(),
         }
+        if self._budgets:
+            state["account_charges"] = self._env.account_charges.tolist()
+            state["lasting_budget_price"] = self._budget_integrals.tolist()
         write_json(folder / "price.json", state)
 
     def load(self, folder: Path) -> None:
@@ -149,6 +213,10 @@ class ServiceMultiplier:
             if not (0.0 <= weight <= 1.0 and (np.isfinite(integrals) & (integrals >= 0.0)).all()):
                 raise ValueError(f"a weight of {weight} and prices of {integrals.tolist()}")
             self._env.service_factors = factors
+            if self._budgets:
+                self._env.account_charges = state["account_charges"]
+                integrals_of_budgets = np.array(state["lasting_budget_price"], dtype=np.float64)
+                self._budget_integrals = np.broadcast_to(integrals_of_budgets, len(self._budgets)).copy()
         except (CirlError, KeyError, TypeError, ValueError) as error:
             raise RunError(f"{path}: cannot be read: {error!r}; it holds the price of service") from error
         self._env.circularity_weight, self._integrals = weight, integrals

@@ -369,7 +369,7 @@ class Arc(Compartment):
             "within the bounds of its control"
         ),
     ] = ""
-    limited_by: Annotated[
+    capacity_node: Annotated[
         str,
         Declaration(
             "node, such as a plant or a fleet, of whose stock x at the start of an interval a controlled flow is at "

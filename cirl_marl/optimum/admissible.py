@@ -71,7 +71,7 @@ class Admissible:
     neutral_valve: Annotated[Floats, "v while nobody acts, shape (steps, nodes)"]
     service_low: Annotated[Floats, "lower end of the band of each service, shape (steps, services)"]
     splits: Annotated[tuple[Split, ...], "the arcs that share what leaves a node"]
-    limited_arcs: Annotated[Integers, "arcs that the stock of another node limits"]
+    capacity_arcs: Annotated[Integers, "arcs that the stock of another node limits"]
     capacity_rate: Annotated[Floats, "flow that a unit of it can carry, shape (steps, limited arcs), 1/time"]
 
     @classmethod
@@ -107,9 +107,9 @@ class Admissible:
             compartment = _setter(network, arc)
             if compartment is not None:
                 setting[:, :, k] = _control_range(network, compartment, agents)
-        limited = [arc for arc in network.arcs if arc.limited_by]
-        limited_arcs = np.array([network.arc_index[arc.id] for arc in limited], dtype=np.intp)
-        setting[0][:, limited_arcs] = 0.0  # as long as nothing is built they carry nothing
+        with_capacity = [arc for arc in network.arcs if arc.capacity_node]
+        capacity_arcs = np.array([network.arc_index[arc.id] for arc in with_capacity], dtype=np.intp)
+        setting[0][:, capacity_arcs] = 0.0  # as long as nothing is built they carry nothing
         split_arcs = network.splits
         for split in split_arcs:
             arcs = [*split.controlled_arcs, *split.other_arcs]
@@ -132,8 +132,8 @@ class Admissible:
             neutral_valve=valve[1],
             service_low=np.array(service_low, dtype=float).reshape(-1, steps).T,
             splits=split_arcs,
-            limited_arcs=limited_arcs,
-            capacity_rate=np.array([network.interval_means(arc.capacity_rate) for arc in limited], dtype=float)
+            capacity_arcs=capacity_arcs,
+            capacity_rate=np.array([network.interval_means(arc.capacity_rate) for arc in with_capacity], dtype=float)
             .reshape(-1, steps)
             .T,
         )
@@ -217,7 +217,7 @@ class IntervalRanges:
         release: rate at which each stock is released to be shared out, lowest and highest, 1/time, shape (2, nodes).
         exits: rate at which each stock leaves in proportion to itself, likewise.
         free_splits: the splits in which some share can be chosen.
-        limited_arcs: arcs that the stock of another node limits.
+        capacity_arcs: arcs that the stock of another node limits.
         capacity_rate: flow that a unit of it can carry, shape (limited arcs,), 1/time.
         totals: what stocks of the network are of those of the planned one, shape (stores, stores).
         followers: arcs whose flows follow from one with which they share what others leave.
@@ -231,7 +231,7 @@ class IntervalRanges:
         self.rate, self.base = admissible.rate[:, step], admissible.base[step]
         self.neutral_rate, self.neutral_valve = admissible.neutral_rate[step], admissible.neutral_valve[step]
         self.driver, self.service_low = admissible.driver, admissible.service_low[step]
-        self.limited_arcs, self.capacity_rate = admissible.limited_arcs, admissible.capacity_rate[step]
+        self.capacity_arcs, self.capacity_rate = admissible.capacity_arcs, admissible.capacity_rate[step]
         self.totals = admissible.lifetimes.totals
         self.proportional = ~self.by_schedule
         self.proportional[admissible.lifetimes.exit_arcs] = False

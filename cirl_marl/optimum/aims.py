@@ -41,21 +41,21 @@ class Aims:
         """Position of the account that alone is kept low; None if there are other aims."""
         return next(iter(self.charges)) if not self.circularity and [*self.charges.values()] == [1.0] else None
 
-    def weighed(self, circularity: Floats | float, accounts: Floats) -> Floats:
+    def objective(self, circularity: Floats | float, accounts: Floats) -> Floats:
         """Return the objective, shape (...), of λ̄ and totals of the accounts, shape (accounts, ...)."""
-        objective: Floats = np.asarray(self.circularity * circularity, dtype=np.float64)
+        result: Floats = np.asarray(self.circularity * circularity, dtype=np.float64)
         for account, charge in self.charges.items():
-            objective = objective - charge * accounts[account]
-        return objective
+            result = result - charge * accounts[account]
+        return result
 
     def value(self, run: Rollout) -> float:
         """Return what the first episode of a rollout has of the objective."""
-        return float(self.weighed(run.episode_circularity[0], run.accounts[0]))
+        return float(self.objective(run.episode_circularity[0], run.accounts[0]))
 
     def size(self, network: Network, accounts: Floats) -> float:
         """Return how large the objective is, given totals of the accounts, shape (accounts,)."""
-        charged = sum(abs(charge * accounts[account]) for account, charge in self.charges.items())
-        return self.circularity * network.objective.circularity_scale + float(charged)
+        account_sizes = sum(abs(charge * accounts[account]) for account, charge in self.charges.items())
+        return self.circularity * network.objective.circularity_scale + float(account_sizes)
 
     def totals(self, run: Rollout) -> Floats:
         """Return the totals of the accounts with budgets, shape (budgets,)."""
@@ -136,18 +136,18 @@ def _check_number(subject: str, number: float) -> None:
         raise CirlError(f"{subject} must be a finite number, got {number!r}")
 
 
-Rates = tuple[Floats, Floats]
+RateTables = tuple[Floats, Floats]
 """What totals have of mean flows and of mean stocks of some intervals; see ``Ledger.rates``."""
 
 
-def rates_over(network: Network, intervals: range) -> Rates:
+def rates_over(network: Network, intervals: range) -> RateTables:
     """Return the rates of the accounts of a network over some intervals."""
     by_flow, by_stock = Ledger(network).rates()
     period = slice(intervals.start, intervals.stop)
     return by_flow[:, period], by_stock[:, period]
 
 
-def totals_over(rates: Rates, flow: Floats, stock: Floats) -> Floats:
+def totals_over(rates: RateTables, flow: Floats, stock: Floats) -> Floats:
     """Return what each interval books on each account, shape (accounts, intervals).
 
     Args:
@@ -156,13 +156,13 @@ def totals_over(rates: Rates, flow: Floats, stock: Floats) -> Floats:
         stock: at the start and after each interval, shape (intervals + 1, stores), mass.
     """
     by_flow, by_stock = rates
-    held = (stock[:-1] + stock[1:]) / 2
-    booked: Floats = np.einsum("atk,tk->at", by_flow, flow) + np.einsum("atk,tk->at", by_stock, held)
-    return booked
+    mean_stock = (stock[:-1] + stock[1:]) / 2
+    bookings: Floats = np.einsum("atk,tk->at", by_flow, flow) + np.einsum("atk,tk->at", by_stock, mean_stock)
+    return bookings
 
 
 def account_rows(
-    lifetimes: Lifetimes, layout: Layout, initial: Floats, rates: Rates
+    lifetimes: Lifetimes, layout: Layout, initial: Floats, rates: RateTables
 ) -> tuple[sparse.csr_array, Floats]:
     """Return what totals are of the variables of a program, exactly, and what they have beside them.
 

@@ -148,11 +148,11 @@ def capacity_limits(ranges: IntervalRanges, rows: ProgramRows) -> None:
     x_start is what the stock is at the start of the interval, a node with a lifetime as a whole.
     """
     layout, network = rows.layout, ranges.network
-    for k, rate in zip(ranges.limited_arcs.tolist(), ranges.capacity_rate.tolist(), strict=True):
-        held = ranges.totals[[network.node_index[network.arcs[k].limited_by]]].toarray()[0]
-        row, stores = rows.add(5, k, layout.moments), np.flatnonzero(held)
+    for k, rate in zip(ranges.capacity_arcs.tolist(), ranges.capacity_rate.tolist(), strict=True):
+        parts = ranges.totals[[network.node_index[network.arcs[k].capacity_node]]].toarray()[0]
+        row, stores = rows.add(5, k, layout.moments), np.flatnonzero(parts)
         rows.put(row, layout.flow + k, 1.0)
-        rows.at_start(row[:, None], 0, stores, -rate * held[stores])
+        rows.at_start(row[:, None], 0, stores, -rate * parts[stores])
 
 
 def constant_schedules(ranges: IntervalRanges, equal: ProgramRows, under: ProgramRows, across: bool) -> None:

@@ -142,7 +142,7 @@ def step_program(
     low *= 1.0 + margin
     measure, by_stage, imbalances = _measures(bound, dynamics)
     accounts = _account_weights(bound, dynamics)
-    weights = -bound.aims.weighed(-_circularity_cost(bound, dynamics), accounts)
+    weights = -bound.aims.objective(-_circularity_cost(bound, dynamics), accounts)
     cost, spent = np.zeros(count), np.zeros((len(limits), count))
     budgets = accounts[[*bound.aims.budgets]]
     state = np.concatenate([stocks, run.flow], axis=1)

@@ -40,7 +40,7 @@ from cirl_marl.optimum.futures import DrawnFutures
 from cirl_marl.optimum.options import check_margin, check_options, demanded_levels, starting_stocks, with_margin
 from cirl_marl.optimum.solver import Infeasible, SolverFailure
 from cirl_marl.optimum.window_planner import Future, WindowPlanner
-from cirl_marl.optimum.windows import NOTHING, Continuation, WindowPlan, WindowTask
+from cirl_marl.optimum.windows import EMPTY, Continuation, WindowPlan, WindowTask
 
 SERVICE_FIRST = 1000.0
 """Weight of the mean service level, against λ̄/circularity_scale, at which service comes first."""
@@ -64,22 +64,22 @@ class _Plan:
 
 
 @positional_record
-class _Owed:
+class _Demands:
     """What services and budgets ask of some intervals."""
 
     deficit: Annotated[Floats | None, "least sum of levels, shape (services,); None if nothing is demanded"]
     limits: Annotated[Floats, "highest totals, in parts of budgets; empty for none"]
     charges: Annotated[Floats, "of totals, in parts of budgets; empty for none"]
 
-    def without(self, outlook: WindowPlan, after: int, later: float | None) -> _Owed:
+    def without(self, outlook: WindowPlan, after: int, later: float | None) -> _Demands:
         """Return what is left if intervals of the ``outlook`` from ``after`` on do as it has them.
 
         Where lacks are priced they deliver, for this sum alone, all that is wanted in ``later`` intervals.
         """
-        delivered = outlook.levels[after:].sum(axis=0) if later is None else later
-        deficit = None if self.deficit is None else self.deficit - delivered
-        limits = self.limits - outlook.booked[after:].sum(axis=0) if len(self.limits) else self.limits
-        return _Owed(deficit, limits, outlook.charges)
+        later_levels = outlook.levels[after:].sum(axis=0) if later is None else later
+        deficit = None if self.deficit is None else self.deficit - later_levels
+        limits = self.limits - outlook.bookings[after:].sum(axis=0) if len(self.limits) else self.limits
+        return _Demands(deficit, limits, outlook.charges)
 
 
 class MPC(Planner):
@@ -239,23 +239,23 @@ class MPC(Planner):
         deficit = None if self._levels is None else self._levels * steps - state.service[:, copy]
         limits = self._aims.limits - state.accounts[[*self._aims.budgets], copy]
         limits /= self._planner.futures[0].budget_size
-        owed = _Owed(deficit, limits, NOTHING)
+        demands = _Demands(deficit, limits, EMPTY)
         if is_priced := self._common_outlook is not None:  # no level is demanded, all that lacks has its price
             deficit = deficit if deficit is None else np.full(len(deficit), float(len(rest)))
-            owed = _Owed(deficit, NOTHING, self._common_outlook.charges)
+            demands = _Demands(deficit, EMPTY, self._common_outlook.charges)
         if last is None:
             self._outlooks.pop(copy, None)
         if len(window) == len(rest):
-            return self._plan(copy, window, owed, last)
+            return self._plan(copy, window, demands, last)
         if self._common_outlook is None and copy not in self._outlooks:
-            self._outlooks[copy] = self._plan(copy, rest, owed, None, is_outlook=True)
+            self._outlooks[copy] = self._plan(copy, rest, demands, None, is_outlook=True)
         outlook = self._common_outlook or self._outlooks[copy]
         after = window.stop - outlook.task.intervals.start
-        owed = owed.without(outlook, after, steps - window.stop if is_priced else None)
+        demands = demands.without(outlook, after, steps - window.stop if is_priced else None)
         later = outlook.continuation(window)
         if self._prices is not None:
             later = replace(later, costs=self._state_costs(later.costs, copy, window))
-        return self._plan(copy, window, owed, last or outlook, later)
+        return self._plan(copy, window, demands, last or outlook, later)
 
     def _state_costs(self, costs: Floats, copy: int, window: range) -> Floats:
         """Return the costs of what comes after a window, with prices that follow the states of the disturbances.
@@ -285,7 +285,7 @@ class MPC(Planner):
         self,
         copy: int,
         intervals: range,
-        owed: _Owed,
+        demands: _Demands,
         last: WindowPlan | None,
         later: Continuation | None = None,
         *,
@@ -296,30 +296,30 @@ class MPC(Planner):
         Args:
             copy: whose stocks they start from.
             intervals: to be planned.
-            owed: what services and budgets ask of them.
+            demands: what services and budgets ask of them.
             last: plan before, from whose basis the solver starts.
             later: what comes after; None at the end of the episode.
             is_outlook: whether the multipliers must be good, as they are the prices of later plans.
         """
         stock = self._env.physical.stock[self._env.rows.nodes, copy]
         planner = self._planner if is_outlook or self._drawn is None else self._planners[copy]
-        return self._solve_task(planner, stock, intervals, owed, last, later, is_outlook=is_outlook)
+        return self._solve_task(planner, stock, intervals, demands, last, later, is_outlook=is_outlook)
 
     def _solve_task(
         self,
         planner: WindowPlanner,
         stock: Floats,
         intervals: range,
-        owed: _Owed,
+        demands: _Demands,
         last: WindowPlan | None,
         later: Continuation | None = None,
         *,
         is_outlook: bool = False,
     ) -> WindowPlan:
         """Plan some intervals from a ``stock``, by stage; see ``_plan``."""
-        demand, budgets = None, len(owed.limits)
-        if owed.deficit is not None:  # no interval delivers more than all that is wanted
-            demand = np.where(self._full, 1.0, np.clip(owed.deficit / len(intervals), 0.0, 1.0))
+        demand, budgets = None, len(demands.limits)
+        if demands.deficit is not None:  # no interval delivers more than all that is wanted
+            demand = np.where(self._full, 1.0, np.clip(demands.deficit / len(intervals), 0.0, 1.0))
         corrections = None if last is None else last.corrections_of(intervals, len(planner.futures))
         first_price = planner.first_price[len(self._aims.budgets) - budgets :]
         price = first_price[: budgets if demand is None else None] if last is None else last.task.price
@@ -327,7 +327,7 @@ class MPC(Planner):
             price = self._price
         is_redrawn = any(low < high for low, high in (part.ends for part in self._env.network.processes.disturbances))
         task = WindowTask(
-            stock, intervals, demand, later, price, corrections, is_outlook, is_redrawn, owed.limits, owed.charges
+            stock, intervals, demand, later, price, corrections, is_outlook, is_redrawn, demands.limits, demands.charges
         )
         return planner.plan(task, last.basis(intervals) if last else None, self._replan)
 
@@ -360,6 +360,6 @@ class MPC(Planner):
         """Return the plan of an episode in which all is as expected, from the middle of the initial ranges."""
         (future,), steps = self._planner.futures, range(self._env.network.episode.horizon)
         deficit = None if self._levels is None else self._levels * len(steps)
-        owed = _Owed(deficit, self._aims.limits / future.budget_size, NOTHING)
+        demands = _Demands(deficit, self._aims.limits / future.budget_size, EMPTY)
         stock = starting_stocks(future.admissible.lifetimes, None)
-        return self._solve_task(self._planner, stock, steps, owed, None, is_outlook=True)
+        return self._solve_task(self._planner, stock, steps, demands, None, is_outlook=True)

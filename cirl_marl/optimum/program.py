@@ -218,8 +218,8 @@ class Programs:
         cost, constant = np.tile(-self._weights / steps, steps), self._constant
         if aims is not None and (aims.budgets or aims.charges):
             totals, beside = account_rows(lifetimes, layout, initial, rates_over(lifetimes.network, intervals))
-            cost = -aims.weighed(-cost, totals.toarray()) if aims.charges else cost
-            constant = float(aims.weighed(constant, beside))
+            cost = -aims.objective(-cost, totals.toarray()) if aims.charges else cost
+            constant = float(aims.objective(constant, beside))
             rows_of_budgets = [*aims.budgets]
             blocks.append(totals[rows_of_budgets])
             limits.append(aims.limits - beside[rows_of_budgets])

@@ -34,7 +34,7 @@ from cirl_marl.dynamics.ledger import Ledger
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
-from cirl_marl.optimum.aims import NO_AIMS, Aims, Rates, account_rows, totals_over
+from cirl_marl.optimum.aims import NO_AIMS, Aims, RateTables, account_rows, totals_over
 from cirl_marl.optimum.constraints import held_controls
 from cirl_marl.optimum.matrices import IntervalCache, Layout, ProgramRows
 from cirl_marl.optimum.program import Program, Programs
@@ -74,7 +74,7 @@ class WindowTrial:
     value: Annotated[float, "objective reached, less what is left to later intervals"]
     level: Annotated[Floats, "mean level of each service, shape (services,)"]
     correction: Annotated[Correction, "what the plan promised and did not keep"]
-    booked: Annotated[Floats, "on budgeted accounts, in parts of budgets, shape (intervals, budgets)"]
+    bookings: Annotated[Floats, "on budgeted accounts, in parts of budgets, shape (intervals, budgets)"]
     promised: Annotated[Floats, "levels of the program, shape (intervals, services)"]
 
 
@@ -112,7 +112,7 @@ class Future:
         self._budgets = [*self.aims.budgets]
         self.budget_size = np.where(self.aims.limits == 0, 1.0, np.abs(self.aims.limits))
         ledger = Ledger(network)
-        self._undiscounted = ledger.rates(discounted=False) if self.aims.charges or self._budgets else None
+        self._raw_rates = ledger.rates(with_discount=False) if self.aims.charges or self._budgets else None
         self._discount: Floats = ledger.discount if like is None else like._discount
         if like is None:
             self._programs = Programs(admissible, degree, service_weight, constant_shares=False)
@@ -146,7 +146,7 @@ class Future:
         cost = problem.cost * (steps / self.horizon)
         if (rates := self._rates(task.intervals)) is not None:
             totals = account_rows(admissible.lifetimes, layout, task.stock, rates)[0].toarray()
-            cost = -self.aims.weighed(-cost, totals)
+            cost = -self.aims.objective(-cost, totals)
             if len(task.charges):
                 cost += (task.charges / self.budget_size) @ totals[self._budgets]
         cost = cost.reshape(steps, -1)
@@ -169,15 +169,15 @@ class Future:
             problem = replace(problem, equal=equal, equal_to=equal_to, low=low, under_to=under_to)
         return problem if task.later is None else with_distance(problem, task.later)
 
-    def _rates(self, intervals: range) -> Rates | None:
+    def _rates(self, intervals: range) -> RateTables | None:
         """Return the rates of the accounts, discounted as in the episode; None if nothing is aimed at there."""
-        if self._undiscounted is None:
+        if self._raw_rates is None:
             return None
         places, discount = self._places(intervals), self._discount[:, intervals.start : intervals.stop, None]
-        by_flow, by_stock = (rates[:, places.start : places.stop] * discount for rates in self._undiscounted)
+        by_flow, by_stock = (rates[:, places.start : places.stop] * discount for rates in self._raw_rates)
         return by_flow, by_stock
 
-    def booked(self, problem: Program, task: WindowTask) -> tuple[Any, Floats]:
+    def booking_rows(self, problem: Program, task: WindowTask) -> tuple[Any, Floats]:
         """Return rows of the totals of budgeted accounts over the variables of a program, and what they have beside.
 
         Both are in parts of the budgets; shapes are (budgets, variables) and (budgets,).
@@ -206,24 +206,24 @@ class Future:
         quantity = np.concatenate([stocks[1:], flows], axis=1) @ self._measure.T
         level = np.divide(quantity, low, out=np.ones_like(low), where=low > 0)
         error = np.where(low > 0, np.clip(self._quantity(problem, plan, variables, low) - level, -1.0, 1.0), 0.0)
-        levels, booked = np.minimum(level, 1.0), np.zeros((len(intervals), len(self._budgets)))
-        accounts, excess = np.zeros((0, len(intervals))), np.zeros_like(booked)
+        levels, bookings = np.minimum(level, 1.0), np.zeros((len(intervals), len(self._budgets)))
+        accounts, excess = np.zeros((0, len(intervals))), np.zeros_like(bookings)
         if (rates := self._rates(task.intervals)) is not None:
             rows = self._simulator.dynamics.rows
-            held = rows.stocks(np.append(stocks, np.ones((len(stocks), 1)), axis=1).T).T
-            accounts = totals_over(rates, flows, held)
-            booked = (accounts[self._budgets] / self.budget_size[:, None]).T
-            planned, beside = self.booked(problem, task)
-            excess += (booked.sum(axis=0) - planned @ plan - beside) / len(intervals)
+            stores = rows.stocks(np.append(stocks, np.ones((len(stocks), 1)), axis=1).T).T
+            accounts = totals_over(rates, flows, stores)
+            bookings = (accounts[self._budgets] / self.budget_size[:, None]).T
+            rows_of_totals, beside = self.booking_rows(problem, task)
+            excess += (bookings.sum(axis=0) - rows_of_totals @ plan - beside) / len(intervals)
         value = self._value(task, flows, stocks[-1], levels, accounts.sum(axis=1))
         if len(task.charges):
-            value -= float(task.charges @ booked.sum(axis=0))
+            value -= float(task.charges @ bookings.sum(axis=0))
         return WindowTrial(
             actions,
             value,
             levels.mean(axis=0),
             Correction(error, excess, *self._factors(variables, intervals)),
-            booked,
+            bookings,
             variables[:, layout.level : layout.imbalance],
         )
 
@@ -256,7 +256,7 @@ class Future:
         per_interval = flows @ weights.sum(axis=0)
         if network.objective.net_zero == "abs":
             per_interval = flows @ weights[0] - np.abs(flows @ weights[1])
-        value = float(self.aims.weighed(per_interval.mean() * share, accounts))
+        value = float(self.aims.objective(per_interval.mean() * share, accounts))
         if self._weight is not None:
             value = value / network.objective.circularity_scale
             value += self._weight * share * float(levels.mean()) if levels.size else 0.0
@@ -296,8 +296,8 @@ class WindowPlanner:
             scales = [np.array([part.scale for part in parts]) for parts in (network.arcs, network.stores)]
             accounts = sum((np.abs(rate) @ scale).sum(axis=1) for rate, scale in zip(rates, scales, strict=True))
             self._scale = size = aims.size(network, np.asarray(accounts))
-        lacking = len(aims.budgets) + len(network.services)
-        self.first_price = np.full(lacking, FIRST_PRICE * size)
+        slack_count = len(aims.budgets) + len(network.services)
+        self.first_price = np.full(slack_count, FIRST_PRICE * size)
 
     def plan(self, task: WindowTask, basis: Basis | None, carried_out: int) -> WindowPlan:
         """Return the best plan that is found, of which the first intervals will be ``carried_out``.
@@ -338,9 +338,9 @@ class WindowPlanner:
                 trial = self._trial(task, basis, rises=0)
             except (Infeasible, SolverFailure):
                 return self._trial(replace(task, corrections=None), None)
-            lacking = len(trial.solution.plan) - self._lacking(task)
+            slack_count = len(trial.solution.plan) - self._slack_count(task)
             is_priced = task.later is not None or task.is_redrawn
-            if is_priced or trial.solution.plan[lacking:].max(initial=0.0) <= SHORTFALL:
+            if is_priced or trial.solution.plan[slack_count:].max(initial=0.0) <= SHORTFALL:
                 return trial
             task, basis = replace(task, corrections=None), None
         return self._trial(task, basis)
@@ -349,7 +349,7 @@ class WindowPlanner:
         """Solve the program of a task and carry its plan out in the simulator."""
         corrections = task.corrections or (None,) * len(self.futures)
         parts = [f.program(task, correction) for f, correction in zip(self.futures, corrections, strict=True)]
-        pairs = [future.booked(part, task) for future, part in zip(self.futures, parts, strict=True)]
+        pairs = [future.booking_rows(part, task) for future, part in zip(self.futures, parts, strict=True)]
         limits = task.limits
         if len(limits):
             limits = limits - np.mean([beside for _, beside in pairs], axis=0)
@@ -360,17 +360,17 @@ class WindowPlanner:
         triples = zip(self.futures, parts, joint.columns, strict=True)
         trials = [future.trial(part, solution.plan[columns], task) for future, part, columns in triples]
         merit, level = float(np.mean([t.value for t in trials])), np.mean([t.level for t in trials], axis=0)
-        booked, budgets = np.mean([t.booked for t in trials], axis=0), len(task.limits)
+        bookings, budgets = np.mean([t.bookings for t in trials], axis=0), len(task.limits)
         if budgets:
-            merit -= float(task.price[:budgets] @ np.maximum(0.0, booked.sum(axis=0) - task.limits))
+            merit -= float(task.price[:budgets] @ np.maximum(0.0, bookings.sum(axis=0) - task.limits))
         if task.demand is not None:
             share = len(task.intervals) / self._horizon
             merit -= float(task.price[budgets:] @ np.maximum(0.0, task.demand - level)) * share
         promised = np.mean([trial.promised for trial in trials], axis=0)
         corrections = tuple(trial.correction for trial in trials)
-        return WindowPlan(task, joint.problem, solution, trials[0].actions, corrections, promised, booked, merit)
+        return WindowPlan(task, joint.problem, solution, trials[0].actions, corrections, promised, bookings, merit)
 
-    def _lacking(self, task: WindowTask) -> int:
+    def _slack_count(self, task: WindowTask) -> int:
         """Return how many budgets and services have a variable for what is exceeded or lacks."""
         return len(task.limits) + (0 if task.demand is None else len(task.demand))
 
@@ -382,44 +382,46 @@ class WindowPlanner:
         if basis is not None and (len(basis.columns), len(basis.rows)) != size:
             basis = None  # of a program with other rows
         label = f"the program of MPC for decisions {task.intervals.start} to {task.intervals.stop - 1}"
-        lacking, price, least, same_rows = self._lacking(task), task.price, None, False
+        slack_count, price, least, same_rows = self._slack_count(task), task.price, None, False
         # a level that lacks counts as the part of the episode that it lacks in
-        share = np.repeat([1.0, len(task.intervals) / self._horizon], [len(task.limits), lacking - len(task.limits)])
+        share = np.repeat(
+            [1.0, len(task.intervals) / self._horizon], [len(task.limits), slack_count - len(task.limits)]
+        )
         is_rough = task.is_outlook and len(problem.cost) >= LARGE_PROGRAM
         run = partial(solve, label=label, certify=task.is_outlook and not is_rough, is_rough=is_rough)
         shortfall = ROUGH_SHORTFALL if is_rough else SHORTFALL
-        if not lacking:
+        if not slack_count:
             return task, run(problem, basis)
-        solution = self._all_demanded(problem, run, lacking) if is_rough else None
+        solution = self._all_demanded(problem, run, slack_count) if is_rough else None
         for rise in range(rises + 1 if solution is None else 0):
-            problem.cost[-lacking:] = price * share
+            problem.cost[-slack_count:] = price * share
             solution = run(problem, basis, same_rows=same_rows, is_near=task.is_redrawn)
-            lack, basis, same_rows = solution.plan[-lacking:], solution.basis, solution.basis is not None
+            lack, basis, same_rows = solution.plan[-slack_count:], solution.basis, solution.basis is not None
             # what comes after was priced beside this price: another one would weigh the two differently
             has_fixed_price = task.later is not None or is_rough or (task.is_redrawn and not task.is_outlook)
             if lack.max() <= shortfall or has_fixed_price or rise == rises:
                 break
             if least is None:
-                only_lack = replace(problem, cost=np.repeat([0.0, 1.0], [len(problem.cost) - lacking, lacking]))
-                least = run(only_lack, basis, certify=False, same_rows=same_rows).plan[-lacking:].sum()
-            if lack.sum() <= least + shortfall * lacking:
+                only_lack = replace(problem, cost=np.repeat([0.0, 1.0], [len(problem.cost) - slack_count, slack_count]))
+                least = run(only_lack, basis, certify=False, same_rows=same_rows).plan[-slack_count:].sum()
+            if lack.sum() <= least + shortfall * slack_count:
                 break
             price = np.where(lack > shortfall, price * RISE, price)
         assert solution is not None
         if task.is_outlook:  # what turns out dearer within windows is not left undone
-            multipliers, lack = -solution.certificate.under[-lacking:], solution.plan[-lacking:]
+            multipliers, lack = -solution.certificate.under[-slack_count:], solution.plan[-slack_count:]
             price = np.where(lack > shortfall, price, np.maximum(price, FIRST_PRICE * multipliers))
         return replace(task, price=price), solution
 
     def _all_demanded(
-        self, problem: Program, run: Callable[[Program, None], Solution], lacking: int
+        self, problem: Program, run: Callable[[Program, None], Solution], slack_count: int
     ) -> Solution | None:
         """Return the optimum of a program in which no service or budget may lack anything; None if there is none.
 
         Of a large program it is tried first: where prices of service are far above all other costs, HiPO stops early.
         """
         cost, high = problem.cost.copy(), problem.high.copy()
-        cost[-lacking:], high[-lacking:] = 0.0, 0.0
+        cost[-slack_count:], high[-slack_count:] = 0.0, 0.0
         try:
             return run(replace(problem, cost=cost, high=high), None)
         except (Infeasible, SolverFailure):

@@ -1,7 +1,7 @@
 """The program of some intervals of an episode: what is to be planned, and what its rows have beside those of a bound.
 
 A demanded level is no row that must hold but has a price, charged per unit that the episode lacks. A price above the
-multiplier of the demand is exact: nothing is lacking that can be had.
+multiplier of the demand is exact: nothing is slack_count that can be had.
 
 Reference: Kerrigan and Maciejowski 2000, UKACC Control (exact penalties in model predictive control).
 """
@@ -20,7 +20,7 @@ from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.program import Program
 from cirl_marl.optimum.solver import Basis, Solution
 
-NOTHING = np.empty(0)
+EMPTY = np.empty(0)
 DISTANCE = 0.1
 """What is charged for stocks at the end of a window that are not those of the plan of the episode, of their price."""
 
@@ -66,10 +66,10 @@ class WindowTask:
     is_outlook: Annotated[bool, "whether the multipliers must be good, as they are the prices of later plans"] = False
     is_redrawn: Annotated[bool, "whether other futures are planned for than before"] = False
     limits: Annotated[Floats, "highest totals over these, in parts of budgets; empty for none"] = field(
-        default_factory=lambda: NOTHING
+        default_factory=lambda: EMPTY
     )
     charges: Annotated[Floats, "of the total of each budgeted account, in parts of budgets; empty for none"] = field(
-        default_factory=lambda: NOTHING
+        default_factory=lambda: EMPTY
     )
 
 
@@ -83,7 +83,7 @@ class WindowPlan:
     actions: Annotated[Floats, "normalised, in the first of the futures, shape (intervals, entries)"]
     corrections: Annotated[tuple[Correction, ...], "what became of it in each future"]
     levels: Annotated[Floats, "that the program promises on average, shape (intervals, services)"]
-    booked: Annotated[Floats, "on budgeted accounts, on average, in parts of budgets, shape (intervals, budgets)"]
+    bookings: Annotated[Floats, "on budgeted accounts, on average, in parts of budgets, shape (intervals, budgets)"]
     merit: Annotated[float, "objective reached there, less what is left to later intervals and what service lacks"]
 
     @property
@@ -184,7 +184,7 @@ class JointProgram:
 
     @classmethod
     def of(
-        cls, parts: Sequence[Program], demand: Floats | None, booked: Sequence[Any] = (), limits: Floats = NOTHING
+        cls, parts: Sequence[Program], demand: Floats | None, bookings: Sequence[Any] = (), limits: Floats = EMPTY
     ) -> JointProgram:
         """Put programs together whose first intervals are alike.
 
@@ -194,7 +194,7 @@ class JointProgram:
             parts: programs without a demand.
             demand: mean level of each service over intervals and futures, shape (services,); None if nothing is
                 demanded.
-            booked: rows of totals over the variables of each part, shape (budgets, variables), sparse.
+            bookings: rows of totals over the variables of each part, shape (budgets, variables), sparse.
             limits: highest of their means, shape (budgets,); empty for none.
         """
         common, count = parts[0].layout.size, len(parts)
@@ -226,12 +226,12 @@ class JointProgram:
                 low=low,
                 high=high,
             )
-        lacking = 0
+        slack_count = 0
         if len(limits):
-            totals = sum((rows @ place / count for rows, place in zip(booked, places, strict=True)))
+            totals = sum((rows @ place / count for rows, place in zip(bookings, places, strict=True)))
             under = sparse.vstack([problem.under, totals], format="csr")
             problem = replace(problem, under=under, under_to=np.append(problem.under_to, limits))
-            lacking = len(limits)
+            slack_count = len(limits)
         if demand is not None and len(demand):
             levels = [level_columns(part) for part in parts]
             weight = -1.0 / (len(levels[0]) // len(demand) * count)
@@ -243,24 +243,24 @@ class JointProgram:
             means.sort_indices()
             under = sparse.vstack([problem.under, means], format="csr")
             problem = replace(problem, under=under, under_to=np.append(problem.under_to, -demand))
-            lacking += len(demand)
-        return cls(with_lack(problem, lacking), tuple(parts), columns)
+            slack_count += len(demand)
+        return cls(with_lack(problem, slack_count), tuple(parts), columns)
 
 
-def with_lack(problem: Program, lacking: int) -> Program:
+def with_lack(problem: Program, slack_count: int) -> Program:
     """Return the program in which the last rows of G may lack something, one variable each."""
-    if not lacking:
+    if not slack_count:
         return problem
-    rows, columns = len(problem.under_to), np.arange(lacking)
-    lack = sparse.csr_array((np.full(lacking, -1.0), (rows - lacking + columns, columns)), shape=(rows, lacking))
-    empty = sparse.csr_array((len(problem.equal_to), lacking))
-    last = problem.under[rows - lacking :]
-    most = np.abs(last) @ np.maximum(np.abs(problem.low), np.abs(problem.high)) - problem.under_to[rows - lacking :]
+    rows = len(problem.under_to)
+    lack = -sparse.eye_array(rows, slack_count, k=slack_count - rows, format="csr")
+    empty = sparse.csr_array((len(problem.equal_to), slack_count))
+    last = problem.under[rows - slack_count :]
+    most = np.abs(last) @ np.maximum(np.abs(problem.low), np.abs(problem.high)) - problem.under_to[rows - slack_count :]
     return replace(
         problem,
-        cost=np.append(problem.cost, np.zeros(lacking)),
+        cost=np.append(problem.cost, np.zeros(slack_count)),
         equal=sparse.hstack([problem.equal, empty], format="csr"),
         under=sparse.hstack([problem.under, lack], format="csr"),
-        low=np.append(problem.low, np.zeros(lacking)),
+        low=np.append(problem.low, np.zeros(slack_count)),
         high=np.append(problem.high, np.maximum(most, 0.0)),
     )

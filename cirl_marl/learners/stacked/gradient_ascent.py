@@ -2,13 +2,14 @@
 
 With K copies, prices p_s and mean levels l_s the stack of all agents of an environment maximises ::
 
-    mean over copies of  λ̄/c + Σ_s p_s·l_s,
+    mean over copies of  λ̄/c + Σ_s p_s·l_s − Σ_b p_b·A_b/|B|,
 
-c the circularity scale. The price of each service is a multiplier that moves after every episode (``price_step``), so
-that an evaluation, of as many episodes as the recipe says, assures what is demanded. An episode is played, and gone
-through backwards (``Derivatives``): what an action is worth goes into the policy that took it and, by what that saw, a
-share of it (``FEEDBACK``) into what came before. Nobody sees more than its own observation. Outputs are clipped to
-their bounds; where one lies beyond, only what leads back counts, as if the clip were not there (straight-through).
+c the circularity scale, A_b the total of an account with a budget B. Each price is a multiplier that moves after every
+episode (``price_step``), so that an evaluation, of as many episodes as the recipe says, assures what is demanded. An
+episode is played, and gone through backwards (``Derivatives``): what an action is worth goes into the policy that took
+it and, by what that saw, a share of it (``FEEDBACK``) into what came before. Nobody sees more than its own observation.
+Outputs are clipped to their bounds; where one lies beyond, only what leads back counts, as if the clip were not there
+(straight-through).
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from cirl_marl.learners.learner import Learner
 from cirl_marl.learners.recipe import Run
 from cirl_marl.learners.stacked.perceptrons import Weights, chain, write_gradients
 from cirl_marl.learners.stacked.stack import Stack
-from cirl_marl.learners.validation import QUANTILE_95, price_step
+from cirl_marl.learners.validation import FIRST_BUDGET_PRICE, QUANTILE_95, budget_levels, charges_of, price_step
 from cirl_marl.network import Floats
 
 FEEDBACK = 0.5
@@ -63,6 +64,11 @@ class GradientStack(Stack):
         stated = np.array([service.weight for service in self._env.network.services]) * (1.0 - weight) / weight
         self._prices: Floats = getattr(first, "service_prices", stated)
         self._integrals: Floats = getattr(first, "price_integrals", np.maximum(stated, LEAST_PRICE))
+        accounts = self._env.ledger.accounts
+        self._budgets = {accounts.index(account): most for account, most in run.at_most.items()}
+        start = np.full(len(self._budgets), FIRST_BUDGET_PRICE)
+        self._budget_prices: tuple[Floats, Floats] = getattr(first, "budget_prices", (start, start))
+        self._charges = np.array(self._env.account_charges)
 
     def learn(self, steps: int) -> None:
         """Learn for the share of ``steps`` that is the learners'."""
@@ -84,6 +90,7 @@ class GradientStack(Stack):
         """Leave with the first model what a resumed training needs beside it: prices, and where the episode begins."""
         first = self._models[0]
         first.service_prices, first.price_integrals = self._prices, self._integrals
+        first.budget_prices = self._budget_prices
         if not self._is_restoring:
             first.episode_start = asdict(self._env.physical)
 
@@ -128,12 +135,14 @@ class GradientStack(Stack):
         count = length * env.num_envs
         by_circularity = np.full(env.num_envs, 1.0 / (env.network.objective.circularity_scale * count))
         by_level = np.repeat(self._prices[:, None] / count, env.num_envs, axis=1)
+        charges = self._charges + charges_of(env, self._budgets, self._budget_prices[1])
+        by_account = np.repeat(-charges[:, None] * by_circularity[0] * length, env.num_envs, axis=1)
         after = self._tape[-1][0].after
         stock, paths = np.zeros_like(after.stock), np.zeros_like(after.disturbances)
         seen = np.zeros((max(span.stop for span in self._observed), env.num_envs))
         gradients: list[list[Tensor]] = []
         for interval, values, slopes in reversed(self._tape):
-            outputs = Outputs(stock, by_circularity, by_level, seen)
+            outputs = Outputs(stock, by_circularity, by_level, seen, by_account)
             stock, by_action, _ = self._derivatives.pull_back(interval, outputs, paths)
             gradients.insert(0, chain(weights.actor, values, self._by_output(by_action, values[-1])))
             by_input = gradients[0][0].cpu().numpy() * slopes
@@ -146,7 +155,7 @@ class GradientStack(Stack):
         weights.optimiser.step()
         self._updates += 1
         levels = after.service / length
-        self._move_prices(levels)
+        self._move_prices(levels, after.accounts)
         self._log(float(after.circularity.mean()) / length, levels.mean(axis=1), rate)
 
     def _by_output(self, by_action: Floats, outputs: Tensor) -> Tensor:
@@ -158,18 +167,26 @@ class GradientStack(Stack):
         gradient[((beyond > 1.0) & (gradient < 0.0)) | ((beyond < -1.0) & (gradient > 0.0))] = 0.0
         return torch.as_tensor(gradient, device=self._device)
 
-    def _move_prices(self, levels: Floats) -> None:
+    def _move_prices(self, levels: Floats, accounts: Floats) -> None:
         """Move them by what nineteen of twenty evaluations assure whose episodes are like these.
 
-        ``levels`` have shape (services, B).
+        ``levels`` have shape (services, B), totals of ``accounts`` (accounts, B).
         """
         run = self._run
         if run.min_service is None:
             return
-        doubt = 2.0 * QUANTILE_95 * levels.std(axis=1) / math.sqrt(run.episodes)
-        margin = np.maximum(doubt, MARGIN * (1.0 - run.min_service))
-        at_once = (self._integrals, levels.mean(axis=1) - margin, run.min_service, run.price_rate, run.price_damping)
-        self._integrals, self._prices = price_step(*at_once, least=LEAST_PRICE)
+
+        def step_prices(integrals: Floats, levels: Floats) -> tuple[Floats, Floats]:
+            doubt = 2.0 * QUANTILE_95 * levels.std(axis=1) / math.sqrt(run.episodes)
+            margin = np.maximum(doubt, MARGIN * (1.0 - min_service))
+            at_once = (integrals, levels.mean(axis=1) - margin, min_service, run.price_rate, run.price_damping)
+            return price_step(*at_once, least=LEAST_PRICE)
+
+        min_service = run.min_service
+        self._integrals, self._prices = step_prices(self._integrals, levels)
+        if self._budgets:
+            levels_of_budgets = budget_levels(self._budgets, accounts, min_service)
+            self._budget_prices = step_prices(self._budget_prices[0], levels_of_budgets)
 
     def _log(self, circularity: float, levels: Floats, rate: float) -> None:
         """Log the figures of an update for each learner with a logger."""

@@ -69,7 +69,7 @@ def arc_problems(
     if arc.law in (Law.DONOR, Law.RECIPIENT, Law.COMPARTMENT) and arc.rate == 0:  # a series may have stood still
         yield f"{subject}: law '{arc.law}' needs a positive rate"
     yield from share_problems(subject, arc, nodes)
-    if arc.limited_by or arc.capacity_rate:
+    if arc.capacity_node or arc.capacity_rate:
         yield from _capacity_problems(subject, arc, nodes)
     if arc.control and arc.control.kind is ControlKind.FLOW and arc.law is not Law.CONTROLLED:
         yield f"{subject}: control.kind 'flow' needs law 'controlled', not '{arc.law}'"
@@ -81,17 +81,17 @@ def arc_problems(
 def _capacity_problems(subject: str, arc: Arc, nodes: Mapping[str, Node]) -> Iterator[str]:
     """Yield why a stock cannot limit what an arc carries."""
     holders = [node.id for node in nodes.values() if node.stores]
-    if not arc.limited_by:
-        yield f"{subject}: capacity_rate: no stock limits it; name its node, limited_by"
-    elif arc.limited_by not in holders:
-        yield f"{subject}: limited_by: {unknown_name('node with a stock', arc.limited_by, holders)}"
-    if arc.limited_by and extremes(arc.capacity_rate)[1] == 0:
-        yield f"{subject}: limited_by: it needs a capacity_rate above 0, the flow that a unit of the stock can carry"
+    if not arc.capacity_node:
+        yield f"{subject}: capacity_rate: no stock limits it; name its node, capacity_node"
+    elif arc.capacity_node not in holders:
+        yield f"{subject}: capacity_node: {unknown_name('node with a stock', arc.capacity_node, holders)}"
+    if arc.capacity_node and extremes(arc.capacity_rate)[1] == 0:
+        yield f"{subject}: capacity_node: it needs a capacity_rate above 0, the flow that a unit of the stock can carry"
     if arc.law is not Law.CONTROLLED:
-        why = "what a proportion of a stock may carry would not be linear in stocks"
-        yield f"{subject}: limited_by needs law 'controlled', not '{arc.law}': {why}"
+        reason = "what a proportion of a stock may carry would not be linear in stocks"
+        yield f"{subject}: capacity_node needs law 'controlled', not '{arc.law}': {reason}"
     elif arc.makes_up_for:
-        yield f"{subject}: limited_by: what makes up for a service has the bounds of its control alone; leave out one"
+        yield f"{subject}: capacity_node: what makes up for a service has the bounds of its control; leave out one"
 
 
 def _batch_problems(subject: str, arc: Arc, network: Specification, nodes: Mapping[str, Node]) -> Iterator[str]:
