@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -59,7 +60,8 @@ from cirl_marl.optimum import bound, improve, improve_plan, simulate_plan, smoot
 from cirl_marl.optimum.aims import Aims
 from cirl_marl.optimum.linearised import jacobians, step_program
 from cirl_marl.optimum.program import Programs
-from cirl_marl.report.iamc import write_iamc
+from cirl_marl.report.data_package import read_package, write_package
+from cirl_marl.report.iamc import read_iamc, write_iamc
 from cirl_marl.report.lever_chart import levers_table, write_levers
 from cirl_marl.report.page_data import page_data
 from cirl_marl.report.report_page import page_of_alternatives
@@ -726,6 +728,85 @@ def test_years_go_to_the_format_of_scenario_databases(tmp_path: Path) -> None:
         write_iamc(tmp_path / "no.csv", [simulate(city(), steps=2)])
     with pytest.raises(CirlError, match="different years"):
         write_iamc(tmp_path / "no.csv", [japan, simulate("steel_japan", steps=3)])
+
+
+def test_years_come_back_from_files_of_scenario_databases(tmp_path: Path) -> None:
+    """What was written, to the last digit; empty cells are missing; what is wrong is named with its line."""
+    japan = simulate("steel_japan", steps=3)
+    path = write_iamc(tmp_path / "iamc.csv", [japan])
+    rows = {row.variable: row for row in read_iamc(path)}
+    assert len(rows) == _size(japan)
+    pig_iron = rows["Flow|pig_iron_made"]
+    flow = japan.rollout.flow[:, japan.network.arc_index["pig_iron_made"]]
+    assert pig_iron.values == dict(zip((2025, 2026, 2027), flow.tolist(), strict=True)) and pig_iron.unit == "kt/yr"
+    head = "Model,Scenario,Region,Variable,Unit,2025,2030\n"
+    path.write_text(f"{head}m,s,World,Primary Energy,EJ/yr,,3.5\n")
+    assert [dict(row.values) for row in read_iamc(path)] == [{2030: 3.5}]
+    for text, message in (
+        (head.replace("Unit", "Units"), "unknown column 'Unit'. Did you mean 'Units'"),
+        (head.replace("2030", "notes"), "column 'notes' is no year"),
+        (f"{head}m,s,World,Steel,t,1,many\n", "line 2: the value of 2030 is no finite number"),
+        (f"{head}m,s,World,Steel,t,1,2\nm,s,World,Steel,kt,1,2\n", "line 3: m, s, World, Steel comes a second time"),
+    ):
+        path.write_text(text)
+        with pytest.raises(CirlError, match=message):
+            read_iamc(path)
+
+
+@pytest.mark.parametrize("name", ["city", "copper_net", "steel_japan"])
+def test_a_data_package_has_a_network_and_its_episode(tmp_path: Path, name: str) -> None:
+    """All numbers come back as they were, with a network that moves in the same way."""
+    network = city().with_options(episode={"horizon": 5}) if name == "city" else load_network(name)
+    done = simulate(network, steps=5)
+    descriptor = json.loads(write_package(tmp_path / "package", done).read_text(encoding="utf-8"))
+    assert {part["name"] for part in descriptor["resources"]} >= {"nodes", "arcs", "stocks", "flows", "accounts"}
+    back, run = read_package(tmp_path / "package"), done.rollout
+    np.testing.assert_array_equal(back.stock, np.concatenate([run.start[None], run.stock]))
+    np.testing.assert_array_equal(back.flow, run.flow)
+    np.testing.assert_array_equal(back.levels, run.levels[0].T)
+    np.testing.assert_array_equal(back.circularity, run.circularity_mean[0])
+    np.testing.assert_allclose(back.bookings, run.bookings[0].T, rtol=1e-12)
+    again = simulate(back.network, steps=5).rollout
+    np.testing.assert_allclose(again.flow, run.flow, rtol=1e-9, atol=1e-9 * np.abs(run.flow).max())
+    with pytest.raises(CirlError, match="package: exists; a data package is a folder of its own"):
+        write_package(tmp_path / "package", done)
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "message"),
+    [
+        ("flows.csv", "0,feed,", "0,fed,", "flows.csv, line .*: unknown arc 'fed'.*Did you mean 'feed'"),
+        ("flows.csv", "interval,arc,flow", "interval,arc,floww", "unknown column 'flow'.*Did you mean 'floww'"),
+        ("stocks.csv", "2,hall,", "7,hall,", "interval '7' is none of 0 to 2"),
+        ("stocks.csv", "2,hall,", "2,hall,x", "stock 'x.*' is no finite number"),
+        ("circularity.csv", "1,", "0,", "no circularity of the network in interval 1"),
+        ("datapackage.json", '"name": "services"', '"name": "service"', "unknown table 'services'.*'service'"),
+        ("datapackage.json", '"resources"', '"resource"', "unknown table 'stocks'"),
+    ],
+)
+def test_data_packages_that_say_something_else_are_refused(
+    tmp_path: Path, file: str, old: str, new: str, message: str
+) -> None:
+    """With the file, the line, and the nearest valid name."""
+    write_package(tmp_path / "package", simulate(city(), steps=2))
+    path = tmp_path / "package" / file
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(CirlError, match=message):
+        read_package(tmp_path / "package")
+
+
+def test_the_command_writes_a_data_package(tmp_path: Path) -> None:
+    """Of one episode; of several it says what to give."""
+    package = ["simulate", "paper_city", "--steps", "3", "--out", str(tmp_path), "--package", str(tmp_path / "data")]
+    done = CliRunner().invoke(app, package)
+    assert done.exit_code == 0 and "datapackage.json" in done.output
+    assert len(read_package(tmp_path / "data").flow) == 3
+    several = ["--control", "neutral", "--control", "random"]
+    for more, message in ((several, "holds one episode"), (["--samples", "2"], "go without --samples")):
+        refused = CliRunner().invoke(app, [*package, *more])
+        assert isinstance(refused.exception, CirlError) and message in str(refused.exception)
 
 
 def _size(simulation: Simulation) -> int:

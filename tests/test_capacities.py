@@ -42,7 +42,7 @@ TECHNOLOGIES = {"old": (10, 4.0, 100.0, 30.0), "new": (15, 0.0, 300.0, 6.0)}
 """Life, capacity at the start, what a unit of capacity costs, and what a unit made with it costs."""
 
 
-def power(years: int = YEARS, in_stages: bool = False) -> Network:
+def power(years: int = YEARS, in_stages: bool = False, available: Series | float = 1.0) -> Network:
     """Return two technologies, whose capacity is built and retires, that meet a demand together."""
     nodes = [Node(id="makers", initial=(1e4, 1e4)), Node(id="retired", initial=(0.0, 0.0))]
     nodes += [Node(id="market", stores=False), Node(id="fuel", initial=(1e5, 1e5), role=Role.NONRENEWABLE_RESERVOIR)]
@@ -61,7 +61,7 @@ def power(years: int = YEARS, in_stages: bool = False) -> Network:
                 law=Law.CONTROLLED,
                 control=replace(ORDER, high=30.0),
                 capacity_node=name,
-                capacity_rate=1.0,
+                capacity_rate=available if name == "old" else 1.0,
             ),
         ]
         arcs[-3] = replace(arcs[-3], accounts={"cost": to_build})
@@ -77,21 +77,22 @@ def power(years: int = YEARS, in_stages: bool = False) -> Network:
     )
 
 
-def least_cost(years: int = YEARS, horizon: int | None = None) -> float:
+def least_cost(available: Series | float = 1.0) -> float:
     """Return the least cost of meeting the demand, by a linear program of builds and outputs written by hand."""
-    names, steps = [*TECHNOLOGIES], years
+    names, steps = [*TECHNOLOGIES], YEARS
     size = len(names) * steps
     cost, discount = np.zeros(2 * size), 1.05 ** -(np.arange(steps) + 0.5)
     under, limits = np.zeros((size + steps, 2 * size)), np.zeros(size + steps)
-    demand = power(years).interval_means(GROWTH)
+    network = power()
+    demand, rates = network.interval_means(GROWTH), [network.interval_means(available), np.ones(steps)]
     for n, (life, held, to_build, to_run) in enumerate(TECHNOLOGIES.values()):
         for t in range(steps):
             built, made, row = n * steps + t, size + n * steps + t, n * steps + t
             cost[built], cost[made] = discount[t] * to_build, discount[t] * to_run
             under[row, made] = 1.0  # output ≤ what was built in the last life + what is left of the start
             for s in range(max(0, t - life), t):
-                under[row, n * steps + s] = -1.0
-            limits[row] = held * max(0.0, 1 - t / life)  # its ages are spread evenly over a life
+                under[row, n * steps + s] = -rates[n][t]
+            limits[row] = rates[n][t] * held * max(0.0, 1 - t / life)  # its ages are spread evenly over a life
             under[size + t, made] = -1.0
     limits[size:] = -demand
     bounds = [(0, 10.0)] * size + [(0, 30.0)] * size
@@ -100,13 +101,15 @@ def least_cost(years: int = YEARS, horizon: int | None = None) -> float:
     return float(found.fun)
 
 
-def test_least_cost_of_two_technologies_is_that_of_a_program_by_hand() -> None:
+@pytest.mark.parametrize("available", [1.0, Series(times=(0.0, 12.0, 20.0), values=(1.0, 0.6, 0.9))])
+def test_least_cost_of_two_technologies_is_that_of_a_program_by_hand(available: Series | float) -> None:
     """Built, aged, retired and run as a linear program of two technologies over 30 years has it, to 1e-6."""
-    found = bound(power(), aim="cost", min_service=1.0)
-    assert found.accounts[0] == pytest.approx(least_cost(), rel=1e-6)
+    found = bound(power(available=available), aim="cost", min_service=1.0)
+    least = least_cost(available)
+    assert found.accounts[0] == pytest.approx(least, rel=1e-6)
     run = simulate_plan(improve_plan(found))
     assert run.episode_levels.min() > 1 - 2e-3
-    assert run.accounts[0, 0] == pytest.approx(least_cost(), rel=3e-3)
+    assert run.accounts[0, 0] == pytest.approx(least, rel=3e-3)
 
 
 @pytest.mark.parametrize(("horizon", "regret"), [(None, 1e-6), (5, 5e-3), (2, 5e-3)])
@@ -122,6 +125,8 @@ def test_who_sees_a_window_pays_little_more(horizon: int | None, regret: float) 
 def test_what_is_built_serves_from_the_next_interval_on(in_stages: bool) -> None:
     """Who orders more than there is capacity for gets c·x of the start of the interval, of a life in stages too."""
     env = MultiAgentVectorEnv(power(in_stages=in_stages), num_envs=1)
+    env.reset(seed=0)
+    assert env.physical.flow[env.network.arc_index["run_old"], 0] == pytest.approx(4.0)  # as it is seen at the start
     run = rollout(env, Neutral())
     stock, flow = run.stock[:, [env.network.node_index[name] for name in TECHNOLOGIES]], run.flow
     made = flow[:, [env.network.arc_index[f"run_{name}"] for name in TECHNOLOGIES]]

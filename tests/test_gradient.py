@@ -10,6 +10,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from small_networks import KINDS, booked, cycle, disturbed_networks, small
+from test_capacities import power
 
 import cirl_marl
 from cirl_marl import Arc, CirlError, ControlError, Law, MultiAgentVectorEnv, Network, load_network
@@ -134,11 +135,13 @@ def test_networks_of_the_catalogue(name: str, monkeypatch: pytest.MonkeyPatch) -
         ("cycle", "services.housed.low"),
         ("copper_world", "services.in_use.low"),
         ("copper_world", "arcs.mining.control.high"),
+        ("power", "arcs.run_old.capacity_rate"),
     ],
 )
 def test_what_disturbs(base: str, path: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shares, capacities and demand, of supplies that make up for services too."""
-    network = (cycle() if base == "cycle" else load_network(base)).with_options(episode={"horizon": 2})
+    """Shares, capacities, limits and demand, of supplies that make up for services too."""
+    bases = {"cycle": cycle(), "power": power()}
+    network = (bases.get(base) or load_network(base)).with_options(episode={"horizon": 2})
     disturbed = {path: DisturbanceEffect(by="price")}
     network = replace(network, disturbances={"price": KINDS["price"]}, disturbed=disturbed, scenarios={})
     env = MultiAgentVectorEnv(network, num_envs=2)

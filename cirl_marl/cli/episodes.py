@@ -41,6 +41,9 @@ def simulate(
     iamc: Annotated[
         Path | None, typer.Option(help="CSV file of years in the IAMC format, for pyam, to write as well.")
     ] = None,
+    package: Annotated[
+        Path | None, typer.Option(help="Folder to write as well: network and episode as a Frictionless data package.")
+    ] = None,
     html: common.Html = None,
 ) -> None:
     """Simulate a network under a controller without learning; write a CSV and a picture.
@@ -55,12 +58,14 @@ def simulate(
     """
     controls, page = control or ["neutral"], common.page_for(html)
     if samples is not None:
-        if iamc is not None:
-            raise CirlError("--iamc goes without --samples")
+        if iamc is not None or package is not None:
+            raise CirlError("--iamc and --package go without --samples")
         _sample(network, scenario or [None], controls, steps, 0 if seed is None else seed, samples, out, page)
         return
     from cirl_marl.evaluation.simulations import simulate_alternatives
 
+    if package is not None and (len(controls) > 1 or len(scenario or ()) > 1):
+        raise CirlError("--package holds one episode: give one scenario and one control")
     constants, folder = _constants(controls, set_ or []), common.folder_for(out or Path(), "--out")
     options: dict[str, Any] = {"controls": controls, "constants": constants, "steps": steps, "seed": seed}
     with common.bar("simulating") as progress:
@@ -75,6 +80,10 @@ def simulate(
         from cirl_marl.report.iamc import write_iamc
 
         paths = [*paths, write_iamc(iamc, found)]
+    if package is not None:
+        from cirl_marl.report.data_package import write_package
+
+        paths = [*paths, write_package(package, found[0])]
     for path in paths:
         common.say(f"wrote {path}")
 

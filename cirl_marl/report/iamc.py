@@ -1,4 +1,4 @@
-"""Episodes in the format of the Integrated Assessment Modeling Consortium, which pyam and scenario databases read.
+"""Episodes in the format of the Integrated Assessment Modeling Consortium, which pyam and scenario databases use.
 
 A row is a model, a scenario, a region, a variable and a unit, with a column for each year. Variables are
 ``Circularity``, ``Service Level|SERVICE``, ``Stock|NODE`` at the end of a year, ``Flow|ARC``, and ``ACCOUNT`` with its
@@ -9,15 +9,19 @@ References: Huppmann et al. 2021, pyam: Analysis and visualisation of integrated
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Annotated
 
-from cirl_marl.errors import CirlError
+from cirl_marl.definitions.data_files import CsvRows, number_in
+from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.calendar import elapsed_time, in_years, year
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Arc
-from cirl_marl.records.files import write_atomically, write_table
+from cirl_marl.records.files import read_content, write_atomically, write_table
 from cirl_marl.records.machine import versions
 
 WORLD = "World"
@@ -39,6 +43,48 @@ def write_iamc(path: str | Path, simulations: Sequence[Simulation]) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, lambda draft: write_table(draft, [*NAMES, *map(str, years[0])], rows))
     return path
+
+
+@positional_record
+class YearlyValues:
+    """A row of a file in the IAMC format."""
+
+    model: Annotated[str, "that made it"]
+    scenario: Annotated[str, "of the model"]
+    region: Annotated[str, "that it is about"]
+    variable: Annotated[str, "with its parts after bars"]
+    unit: Annotated[str, "of its values"]
+    values: Annotated[Mapping[int, float], "by year; what is left empty is missing"]
+
+
+def read_iamc(path: str | Path) -> list[YearlyValues]:
+    """Read a CSV file in the IAMC format, with a column for each year.
+
+    Raises:
+        CirlError: for a missing column, one that is no year, a cell that is no number, or a row that comes twice; names
+            the file and the line.
+    """
+    rows = CsvRows(str(path), read_content(Path(path)))
+    header = [cell.strip() for cell in rows[0]]
+    columns = {cell.lower(): place for place, cell in enumerate(header)}
+    for name in NAMES:
+        if name.lower() not in columns:
+            raise CirlError(f"{path}: {unknown_name('column', name, header)}")
+    places = [columns[name.lower()] for name in NAMES]
+    years = {place: cell for place, cell in enumerate(header) if place not in places}
+    if wrong := [cell for cell in years.values() if not (cell.isdecimal() and len(cell) == 4)]:
+        raise CirlError(f"{path}: column '{wrong[0]}' is no year, such as 2030, and none of {', '.join(NAMES)}")
+    table: dict[tuple[str, ...], YearlyValues] = {}
+    for line, cells in zip(rows.lines[1:], rows[1:], strict=True):
+        values = {int(year_): number_in(cells[place]) for place, year_ in years.items() if cells[place].strip()}
+        if not all(map(math.isfinite, values.values())):
+            at = next(year_ for year_, value in values.items() if not math.isfinite(value))
+            raise CirlError(f"{path}, line {line}: the value of {at} is no finite number")
+        model, scenario, region, variable, unit = (cells[place] for place in places)
+        if (names := (model, scenario, region, variable)) in table:
+            raise CirlError(f"{path}, line {line}: {', '.join(names)} comes a second time")
+        table[names] = YearlyValues(*names, unit, values)
+    return [*table.values()]
 
 
 def _years(network: Network) -> list[int]:
