@@ -106,6 +106,12 @@ if TYPE_CHECKING:
     from cirl_marl.optimum.smooth import smooth_plan as smooth_plan
     from cirl_marl.reasons.explanation import explain as explain
     from cirl_marl.reasons.inverse import infer as infer
+    from cirl_marl.report.data_package import EpisodePackage as EpisodePackage
+    from cirl_marl.report.data_package import read_package as read_package
+    from cirl_marl.report.data_package import write_package as write_package
+    from cirl_marl.report.iamc import YearlyValues as YearlyValues
+    from cirl_marl.report.iamc import read_iamc as read_iamc
+    from cirl_marl.report.iamc import write_iamc as write_iamc
     from cirl_marl.report.presentation import draw as draw
     from cirl_marl.report.presentation import summarise as summarise
     from cirl_marl.report.presentation import write_report as write_report
@@ -167,6 +173,8 @@ _MODULES = {
     "optimum.smooth": "smooth_plan",
     "reasons.explanation": "explain",
     "reasons.inverse": "infer",
+    "report.data_package": "EpisodePackage read_package write_package",
+    "report.iamc": "YearlyValues read_iamc write_iamc",
     "report.presentation": "draw summarise write_report",
     "suite.result_rows": "pretrained",
     "suite.row_jobs": "benchmark",

@@ -94,6 +94,23 @@ def test_a_copy_stands_for_each_region(folder: Path) -> None:
     np.testing.assert_allclose(flow["landed"], (flow["japan_lost"] + flow["china_lost"]) / 4)
 
 
+def test_a_copy_is_limited_by_its_own_plant(folder: Path) -> None:
+    """What limits an arc of the file is the copy of it in each region."""
+    range_ = f'kind = "flow", low = 0, neutral = 1, high = 2, unit = "kt/year", {SOURCE}'
+    limited = f"""
+[arcs.returned]
+from = "dump"
+to = "use"
+law = "controlled"
+capacity_node = "use"
+capacity_rate = {{ value = 0.5, unit = "1/year", {SOURCE} }}
+control = {{ {range_} }}
+"""
+    written(folder, COPIED + limited)
+    found = {arc.id: arc.capacity_node for arc in network(folder).arcs if arc.capacity_node}
+    assert found == {"japan_returned": "japan_use", "china_returned": "china_use"}
+
+
 def test_a_scenario_is_that_of_the_copies_too(folder: Path) -> None:
     """Then what it says of the copies here, then its own tables, of copies and of what joins them."""
     found = network(folder, scenario="more")

@@ -28,7 +28,7 @@ PACKAGE, DEFINITION = "datapackage.json", "network.toml"
 PROFILE = "https://datapackage.org/profiles/2.0/datapackage.json"
 KEYS = {"stocks": ("node", "nodes"), "flows": ("arc", "arcs")}
 """Columns of tables that hold ids of another."""
-Field = tuple[str, str, str]
+TableField = tuple[str, str, str]
 """Name, type and meaning of a column."""
 
 
@@ -82,7 +82,7 @@ def write_package(folder: str | Path, simulation: Simulation) -> Path:
     return folder / PACKAGE
 
 
-def _tables(simulation: Simulation) -> dict[str, tuple[list[Field], Iterable[Sequence[object]]]]:
+def _tables(simulation: Simulation) -> dict[str, tuple[list[TableField], Iterable[Sequence[object]]]]:
     """Return the fields and rows of each table, by name."""
     network, run, ledger = simulation.network, simulation.rollout, simulation.env.ledger
     steps, stocks = range(len(run.flow)), np.concatenate([run.start[None], run.stock])
