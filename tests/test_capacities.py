@@ -27,6 +27,7 @@ from cirl_marl import (
     Service,
     load_network,
     parallel_env,
+    simulate,
     write_network,
 )
 from cirl_marl.controllers import Neutral
@@ -34,6 +35,7 @@ from cirl_marl.controllers.rollout import rollout
 from cirl_marl.network.elements import Lifetime
 from cirl_marl.network.uncertainty import Spread
 from cirl_marl.optimum import bound, improve_plan, simulate_plan
+from cirl_marl.report.terminal import law_text
 
 ORDER = Control(kind=ControlKind.FLOW, low=0.0, neutral=10.0, high=10.0)
 YEARS = 30
@@ -134,6 +136,15 @@ def test_what_is_built_serves_from_the_next_interval_on(in_stages: bool) -> None
     np.testing.assert_allclose(made, np.minimum(start, 10.0), rtol=1e-12, atol=1e-12)
     assert made[0, 1] == 0.0 < made[1, 1] <= 10.0 == made[-1, 1]
     assert made[0, 0] == pytest.approx(4.0)
+
+
+def test_a_plant_is_no_lack_of_its_donor(tmp_path: Path) -> None:
+    """Tables say what limits a flow; nobody is told that a donor held too little where the plant was too small."""
+    text = str(simulate(power(), control="neutral"))
+    assert "held too little" not in text
+    assert law_text(power(), power().arcs[3]) == "u ≤ 1 x(old)"
+    changing = power(available=Series(times=(0.0, 9.0), values=(1.0, 0.5)))
+    assert law_text(changing, changing.arcs[3]) == f"u ≤ {changing.arcs[3].capacity_rate:g} x(old)"
 
 
 def test_agents_see_what_limits_them(tmp_path: Path) -> None:

@@ -73,12 +73,13 @@ def system(network: Network) -> Floats:
 
 
 def ample(network: Network, interval: float) -> Network:
-    """Return the network with stocks that nothing exhausts soon."""
+    """Return the network with stocks that nothing exhausts soon, and no limits on flows."""
     nodes = tuple(
         replace(node, initial=(900.0, 1000.0 + 10 * i)) if node.stores else node for i, node in enumerate(network.nodes)
     )
     episode = replace(network.episode, control_interval=interval)
-    return replace(network, nodes=nodes, episode=episode)
+    arcs = tuple(replace(arc, capacity_node="", capacity_rate=0.0) for arc in network.arcs)
+    return replace(network, nodes=nodes, arcs=arcs, episode=episode)
 
 
 def stays_positive(network: Network, interval: float) -> bool:

@@ -148,7 +148,8 @@ def rollout(
         controls[t] = env.controls[:, 0]
         if len(orders):
             step = np.full(env.num_envs, t)
-            ordered_flow = env.dynamics.rate(env.controls, step, env.factors_in(step))[orders]
+            factors, begin = env.factors_in(step), env.interval.before.stock
+            ordered_flow = env.dynamics.rate_within_capacities(begin, env.controls, step, factors)[orders]
             short = ordered_flow - outcome.flow[orders]
             shortage[t] = np.where(short > ROUNDING * np.abs(ordered_flow), short, 0.0).mean(axis=1)
         circularity[:, t], mean[:, t] = outcome.circularity, outcome.circularity_mean

@@ -111,9 +111,7 @@ class Dynamics(FlowLaws):
                 f"network '{self.network.name}': advance needs step, the index of the control interval of each copy: "
                 f"time series and batches depend on it, those of arc '{self._needs_step[0]}' for one"
             )
-        rate = actual_rate = self.rate(controls, step, factors)
-        if self.capacities:
-            self.capacities.cut(rate, stock, step, factors)
+        rate = actual_rate = self.rate_within_capacities(stock, controls, step, factors)
         if self.slots is not None:
             stock = self.slots.shift_slots(stock)
             self.slots.set_outflows(stock, rate)
@@ -144,6 +142,15 @@ class Dynamics(FlowLaws):
         flow, arcs = self._flow_at(stock, inner, controls, actual_rate, routes), len(self.network.arcs)
         return Transition(stock, inner, total[:arcs], flow[:arcs], batch_mass)
 
+    def rate_within_capacities(
+        self, stock: Floats, controls: Floats, step: Integers | None, factors: Floats | None
+    ) -> Floats:
+        """Return r of each arc in an interval that starts from ``stock``, which may limit scheduled flows."""
+        rate = self.rate(controls, step, factors)
+        if self.capacities:
+            self.capacities.cut(rate, stock, step, factors)
+        return rate
+
     def _check_finite(self, stock: Floats, inner: Floats) -> None:
         if np.isfinite(stock).all() and np.isfinite(inner).all():
             return
@@ -159,9 +166,7 @@ class Dynamics(FlowLaws):
     def start_flow(self, stock: Floats, inner: Floats, controls: Floats, factors: Floats | None = None) -> Floats:
         """Return the flows at the start of an episode, cut to what the donors hold, shape (arcs, B), mass/time."""
         first = np.zeros(stock.shape[1], dtype=np.intp)
-        rate = self.rate(controls, first, factors)
-        if self.capacities:
-            self.capacities.cut(rate, stock, first, factors)
+        rate = self.rate_within_capacities(stock, controls, first, factors)
         if self.slots is not None:
             stock = self.slots.shift_slots(stock)
             self.slots.set_outflows(stock, rate)

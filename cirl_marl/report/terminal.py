@@ -90,6 +90,8 @@ def law_text(network: Network, arc: Arc) -> str:
     if arc.law is Law.RECIPIENT:
         return f"{arc.rate:g} x({arc.recipient})"
     if arc.law is Law.CONTROLLED:
+        if arc.capacity_node:
+            return f"u ≤ {arc.capacity_rate:g} x({arc.capacity_node})"
         return f"u, makes up for {arc.makes_up_for}" if arc.makes_up_for else "u"
     if arc.law is Law.COMPARTMENT:
         return f"{arc.rate:g} y({arc.by})"
