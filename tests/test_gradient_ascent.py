@@ -46,9 +46,9 @@ def test_gradients_go_through_the_policies(
 
     def check(stack: GradientStack, progress_remaining: float) -> None:
         tape, env, prices = stack._tape, stack._env, stack._prices.copy()
-        charges = np.zeros(len(env.ledger.accounts))
+        charges = env.account_charges / env.network.objective.circularity_scale
         for place, (account, most) in enumerate(budgets.items()):
-            charges[env.ledger.accounts.index(account)] = stack._budget_prices[1][place] / abs(most)
+            charges[env.ledger.accounts.index(account)] += stack._budget_prices[1][place] / abs(most)
         monkeypatch.setattr(stack._weights.optimiser, "step", lambda: None)
         ascend(stack, progress_remaining)
         monkeypatch.undo()
@@ -91,7 +91,7 @@ def test_gradients_go_through_the_policies(
     monkeypatch.setattr(GradientStack, "_ascend", check)
     monkeypatch.setattr(gradient_ascent, "FEEDBACK", share)
     asked = {"steps": 8, "evaluations": 1, "at_most": budgets, "price_rate": 0.1}
-    train(booked(load_network("carbo_net"), 2), recipe(asked))
+    train(booked(load_network("carbo_net"), 2), recipe(asked), charges={"cost": 30.0} if budgets else {})
     assert len(checked) == 1 and checked[0] > 0
 
 
