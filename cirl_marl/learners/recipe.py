@@ -12,11 +12,13 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    SerializerFunctionWrapHandler,
     StrictBool,
     StrictStr,
     ValidationError,
     WithJsonSchema,
     field_validator,
+    model_serializer,
 )
 from pydantic_core import PydanticCustomError
 
@@ -213,6 +215,12 @@ class Run(Settings):
         description="by how much the logarithm of that price is higher still, only as long as service is short by as "
         "much as it may be at all; lower as long as there is too much",
     )
+
+    @model_serializer(mode="wrap")
+    def _as_before_budgets(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out budgets that there are not, so that cells of sweeps keep the names they had before."""
+        settings: dict[str, Any] = write(self)
+        return {key: value for key, value in settings.items() if value or key != "at_most"}
 
 
 @dataclass(frozen=True, slots=True)
