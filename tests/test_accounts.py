@@ -15,6 +15,7 @@ from conftest import random_network
 from hypothesis import given
 from hypothesis import strategies as st
 from small_networks import ACCOUNTS, booked, plain_networks, small
+from test_capacities import power
 from test_optimum import bounded, certifiable, pinned
 from typer.testing import CliRunner
 
@@ -296,6 +297,17 @@ def test_what_cannot_be_asked_for_is_told() -> None:
         plan(network, "mpc", aim="costs", min_service=0.9)
     with pytest.raises(CirlError, match="service_weight goes with the aim"):
         MPC(aim="cost", service_weight=1.0)
+    with pytest.raises(CirlError, match="horizon 5: whether a budget is kept depends on the whole episode"):
+        MPC(horizon=5, at_most={"cost": 1e9}).start(MultiAgentVectorEnv(network, num_envs=1), 0)
+    for wrong, words in (
+        ({"aim": 3}, "aim: give 'circularity', an account"),
+        ({"aim": None}, "aim: give 'circularity', an account"),
+        ({"at_most": ["cost"]}, "at_most: give {account: total}"),
+        ({"aim": {"cost": 1.0}, "at_most": {"cost": 1.0}}, "kept as low as can be already"),
+    ):
+        with pytest.raises(CirlError, match=words):
+            bound(network, **wrong)
+    assert bound(network, aim={"circularity": 1.0}, service_weight=1.0).aims.is_circular
 
 
 def halfway(network: Network) -> float:
@@ -322,15 +334,14 @@ def test_weights_are_prices_of_budgets() -> None:
     assert dearer.objective == pytest.approx(-dearer.accounts @ [1.0, 2e3], rel=1e-6)
 
 
-@pytest.mark.parametrize("horizon", [None, 20, 5])
-def test_mpc_keeps_budgets(horizon: int | None) -> None:
-    """Of all windows, with the service and close to the λ̄ of the bound from the same start; stocks book too."""
+def test_mpc_keeps_budgets() -> None:
+    """With the service and close to the λ̄ of the bound from the same start; stocks book too."""
     network = city()
     stores = [replace(node, holding={"emissions": 0.05}) if node.stores else node for node in network.nodes]
     network = replace(network, nodes=tuple(stores))
     most = halfway(network)
     env = MultiAgentVectorEnv(network, num_envs=1)
-    run = rollout(env, MPC(horizon=horizon, min_service=0.95, at_most={"emissions": most}))
+    run = rollout(env, MPC(min_service=0.95, at_most={"emissions": most}))
     found = bound(network, run.start, min_service=0.95, at_most={"emissions": most})
     assert run.accounts[0, 1] <= most * (1 + 1e-5)
     assert run.episode_levels.min() >= 0.95 - 2e-3
@@ -365,6 +376,10 @@ def test_budgets_of_learners_that_cannot_be_meant_are_refused() -> None:
         MultiAgentVectorEnv(network, num_envs=1, charges={"cots": 1.0})
     with pytest.raises(CirlError, match="charges count in rewards with λ, not in 'local'"):
         MultiAgentVectorEnv(network, num_envs=1, reward="local", charges={"cost": 1.0})
+    wrong_charges: list[tuple[Any, str]] = [({"cost": "x"}, "that of 'cost' must be a number")]
+    for charges, message in (*wrong_charges, (["cost"], "give {account: number}")):
+        with pytest.raises(CirlError, match=f"charges: {message}"):
+            MultiAgentVectorEnv(network, num_envs=1, charges=charges)
     with pytest.raises(CirlError, match="charges must be finite numbers"):
         MultiAgentVectorEnv(network, num_envs=1, charges={"cost": float("nan")})
     charged = parallel_env(network, reward="team", charges={"cost": 1e-6}).unwrapped
@@ -377,6 +392,36 @@ def test_what_a_plan_books_beyond_its_program_the_next_one_has_less_of() -> None
     run = rollout(MultiAgentVectorEnv("steel_japan", num_envs=1), MPC(min_service=0.99, at_most={"emissions": 2860.0}))
     assert run.accounts[0, 0] <= 2860.0 * (1 + 2e-5)
     assert run.episode_levels.min() >= 0.99 - 2e-3
+
+
+def test_budgets_out_of_reach_are_approached_and_said() -> None:
+    """Zero of what costs something: nothing is done, and what is missing is told."""
+    network, control = power(6), MPC(min_service=0.5, at_most={"cost": 0.0})
+    run = rollout(MultiAgentVectorEnv(network, num_envs=1), control)
+    assert run.accounts[0, 0] == pytest.approx(0.0, abs=1e-6)
+    assert "this one has 0.5000 less of 'demand'" in control.note
+    tight = MPC(min_service=1.0, at_most={"cost": 1.02 * bound(power(8), aim="cost", min_service=1.0).accounts[0]})
+    run = rollout(MultiAgentVectorEnv(power(8), num_envs=1), tight)
+    assert not tight.note and run.episode_levels.min() > 1 - 1e-6
+
+
+def test_a_budget_of_nothing_has_a_price() -> None:
+    """Plans beside it get better; its price is no infinity."""
+    network = power(6)
+    arcs = [replace(arc, accounts={"cost": -400.0}) if arc.id == "use" else arc for arc in network.arcs]
+    network = replace(network, arcs=tuple(arcs), objective=replace(network.objective, circularity_scale=100.0))
+    found = bound(network, at_most={"cost": 0.0}, min_service=0.5)
+    assert np.isfinite(improve.prices(found)).all()
+    assert simulate_plan(improve_plan(found)).accounts[0, 0] <= 1e-6
+
+
+@pytest.mark.medium
+def test_a_plan_is_not_left_for_a_worse_one() -> None:
+    """Where no plan is within the budget, what is done in the end takes no more than the first plan did, or nearly."""
+    control = MPC(min_service=0.95, at_most={"emissions": 2650.0})
+    run = rollout(MultiAgentVectorEnv("steel_japan", num_envs=1, horizon=12), control)
+    free = rollout(MultiAgentVectorEnv("steel_japan", num_envs=1, horizon=12), MPC(min_service=0.95))
+    assert run.accounts[0, 0] <= free.accounts[0, 0] * (1 + 1e-6)
 
 
 def test_mpc_in_a_disturbed_network_charges_for_budgets() -> None:
@@ -742,6 +787,12 @@ def test_years_go_to_the_format_of_scenario_databases(tmp_path: Path) -> None:
     assert rows[-1]["Region"] == "japan" and total == run.bookings[0, 0].tolist()
     with pytest.raises(CirlError, match="IAMC has calendar years; give"):
         write_iamc(tmp_path / "no.csv", [simulate(city(), steps=2)])
+    with pytest.raises(CirlError, match="Circularity would come 2 times; give other titles"):
+        write_iamc(tmp_path / "no.csv", [japan, japan])
+    with pytest.raises(CirlError, match="give at least one episode"):
+        write_iamc(tmp_path / "no.csv", [])
+    with pytest.raises(CirlError, match="no such file"):
+        read_iamc(tmp_path / "no.csv")
     with pytest.raises(CirlError, match="different years"):
         write_iamc(tmp_path / "no.csv", [japan, simulate("steel_japan", steps=3)])
 
@@ -761,6 +812,7 @@ def test_years_come_back_from_files_of_scenario_databases(tmp_path: Path) -> Non
     for text, message in (
         (head.replace("Unit", "Units"), "unknown column 'Unit'. Did you mean 'Units'"),
         (head.replace("2030", "notes"), "column 'notes' is no year"),
+        (head.replace("2030", "2025"), "column '2025' comes a second time"),
         (f"{head}m,s,World,Steel,t,1,many\n", "line 2: the value of 2030 is no finite number"),
         (f"{head}m,s,World,Steel,t,1,2\nm,s,World,Steel,kt,1,2\n", "line 3: m, s, World, Steel comes a second time"),
     ):
@@ -777,6 +829,7 @@ def test_a_data_package_has_a_network_and_its_episode(tmp_path: Path, name: str)
     descriptor = json.loads(write_package(tmp_path / "package", done).read_text(encoding="utf-8"))
     assert {part["name"] for part in descriptor["resources"]} >= {"nodes", "arcs", "stocks", "flows", "accounts"}
     back, run = read_package(tmp_path / "package"), done.rollout
+    assert (back.scenario, back.control) == ("default", "neutral")
     np.testing.assert_array_equal(back.stock, np.concatenate([run.start[None], run.stock]))
     np.testing.assert_array_equal(back.flow, run.flow)
     np.testing.assert_array_equal(back.levels, run.levels[0].T)
@@ -795,7 +848,9 @@ def test_a_data_package_has_a_network_and_its_episode(tmp_path: Path, name: str)
         ("flows.csv", "interval,arc,flow", "interval,arc,floww", "unknown column 'flow'.*Did you mean 'floww'"),
         ("stocks.csv", "2,hall,", "7,hall,", "interval '7' is none of 0 to 2"),
         ("stocks.csv", "2,hall,", "2,hall,x", "stock 'x.*' is no finite number"),
-        ("circularity.csv", "1,", "0,", "no circularity of the network in interval 1"),
+        ("circularity.csv", "1,", "0,", "line 3: circularity of the network comes a second time"),
+        ("flows.csv", "1,feed,", "0,feed,", "flows.csv, line .*: flow of feed comes a second time"),
+        ("stocks.csv", "2,hall,", "2,hall,1\n2,bales,", "stocks.csv, line .*: stock of bales comes a second time"),
         ("datapackage.json", '"name": "services"', '"name": "service"', "unknown table 'services'.*'service'"),
         ("datapackage.json", '"resources"', '"resource"', "unknown table 'stocks'"),
     ],
@@ -810,6 +865,17 @@ def test_data_packages_that_say_something_else_are_refused(
     assert old in text
     path.write_text(text.replace(old, new, 1), encoding="utf-8")
     with pytest.raises(CirlError, match=message):
+        read_package(tmp_path / "package")
+
+
+def test_what_nobody_books_comes_back_as_nothing(tmp_path: Path) -> None:
+    """And a table that is not there is named."""
+    network = replace(city(), accounts=(*ACCOUNTS, Account(id="idle", unit="t")))
+    write_package(tmp_path / "package", simulate(network, steps=2))
+    back = read_package(tmp_path / "package")
+    assert not back.bookings[:, 2].any() and back.bookings[:, :2].all()
+    (tmp_path / "package" / "flows.csv").unlink()
+    with pytest.raises(CirlError, match=r"flows\.csv: no such file"):
         read_package(tmp_path / "package")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -162,9 +163,10 @@ def test_each_budget_has_its_price(tmp_path: Path, reward: str) -> None:
     network = booked(load_network("paper_city").with_options(episode={"horizon": 8}), 3)
     first, charged = ACCOUNTS[0].id, ACCOUNTS[1].id
     env, plain, other = (MultiAgentVectorEnv(network, num_envs=2, reward=reward) for _ in range(3))
-    multiplier = Multipliers(env, 0.95, 0.5, 0.0, {charged: -40.0, first: 10.0})
-    multiplier.update([1.0], [10.2, -39.0])
     scale = network.objective.circularity_scale
+    multiplier = Multipliers(env, 0.95, 0.5, 0.0, {charged: -40.0, first: 10.0})
+    np.testing.assert_allclose(env.account_charges, 0.1 * scale / np.array([10.0, 40.0]))
+    multiplier.update([1.0], [10.2, -39.0])
     shares = np.array([0.2 / 10.0, 1.0 / 40.0]) / 0.05
     expected = 0.1 * np.exp(0.5 * shares) * scale / [10.0, 40.0]
     np.testing.assert_allclose(env.account_charges, expected, rtol=1e-12)
@@ -189,6 +191,17 @@ def test_each_budget_has_its_price(tmp_path: Path, reward: str) -> None:
     for _ in range(100):
         multiplier.update([1.0], [0.0, -100.0])
     np.testing.assert_allclose(env.account_charges, 1e-4 * scale / np.array([10.0, 40.0]))
+
+
+def test_budgets_come_beside_charges_and_without_services() -> None:
+    """What the environment charges for anyhow stays; prices of budgets move where there is no service, too."""
+    network = replace(booked(load_network("paper_city"), 3), services=())
+    env = MultiAgentVectorEnv(network, num_envs=1, reward="team", charges={"emissions": 3.0})
+    multiplier = Multipliers(env, 0.9, 1.0, 0.0, {"cost": 500.0})
+    before, weight = env.account_charges.copy(), env.circularity_weight
+    multiplier.update([], [600.0, 1.0])
+    assert before[0] > 0 and env.account_charges[0] == pytest.approx(before[0] * np.e)
+    assert env.account_charges[1] == before[1] == 3.0 and env.circularity_weight == weight
 
 
 def test_a_checkpoint_that_exceeds_a_budget_is_no_better() -> None:

@@ -113,6 +113,8 @@ def numbers_by_name(entries: Sequence[str] | None, option: str, form: str) -> di
     numbers = {}
     for entry in entries or ():
         name, _, number = entry.partition("=")
+        if name in numbers:
+            raise CirlError(f"{option} {entry}: '{name}' is given twice")
         try:
             numbers[name] = float(number)
         except ValueError:

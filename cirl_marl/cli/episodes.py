@@ -66,6 +66,8 @@ def simulate(
 
     if package is not None and (len(controls) > 1 or len(scenario or ()) > 1):
         raise CirlError("--package holds one episode: give one scenario and one control")
+    if package is not None and package.exists():
+        raise CirlError(f"--package {package}: exists; a data package is a folder of its own, so give another name")
     constants, folder = _constants(controls, set_ or []), common.folder_for(out or Path(), "--out")
     options: dict[str, Any] = {"controls": controls, "constants": constants, "steps": steps, "seed": seed}
     with common.bar("simulating") as progress:

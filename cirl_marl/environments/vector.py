@@ -144,7 +144,8 @@ class MultiAgentVectorEnv:
         self.scoring = Scoring(self.dynamics, self.layout, self.agents, num_envs)
         self.idle = self.supply.idle(self.agents)
         self._credit = Credit(self.dynamics, self.supply, self.scoring, self.agents, self.reward_mode, moment)
-        self.account_charges = [(charges or {}).get(account, 0.0) for account in self._accounts(charges or {})]
+        charges = {} if charges is None else charges
+        self.account_charges = [charges.get(account, 0.0) for account in self._accounts(charges)]
         self.observation_names = self.layout.names
         self._starts = Starts(variant, self.dynamics, num_envs, self.layout.array_order)
         self.rows = self.dynamics.rows
@@ -201,7 +202,11 @@ class MultiAgentVectorEnv:
 
     def _accounts(self, charges: Mapping[str, float]) -> tuple[str, ...]:
         """Return the accounts; refuse charges of others, or in rewards that have no λ."""
-        for account in charges:
+        if not isinstance(charges, Mapping):
+            raise CirlError(f"charges: give {{account: number}}, got {charges!r}")
+        for account, charge in charges.items():
+            if isinstance(charge, bool) or not isinstance(charge, int | float | np.number):
+                raise CirlError(f"charges: that of '{account}' must be a number, got {charge!r}")
             if account not in self.ledger.accounts:
                 fault = unknown_name("account", account, self.ledger.accounts)
                 raise CirlError(f"network '{self.network.name}': charges: {fault}")

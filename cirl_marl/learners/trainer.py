@@ -136,7 +136,8 @@ class Training:
         """Return the multipliers of the services and budgets if they move."""
         settings = self.config.recipe.run
         by_evaluations = bool(settings.price_rate) and settings.engine != "gradients"
-        if not by_evaluations or settings.min_service is None or not self.env.network.services:
+        is_constrained = bool(self.env.network.services or settings.at_most)
+        if not by_evaluations or settings.min_service is None or not is_constrained:
             return None
         if self.env.reward_mode not in CIRCULARITY_REWARDS:
             raise RecipeError(

@@ -170,6 +170,8 @@ class Multipliers:
         self._env, self._min_service, self._rate, self._damping_gain = env, min_service, rate, damping_gain
         self._budgets = {env.ledger.accounts.index(account): most for account, most in at_most.items()}
         self._budget_integrals: Floats = np.full(len(self._budgets), FIRST_BUDGET_PRICE)
+        self._base_charges: Floats = np.array(env.account_charges)
+        self._charge(self._budget_integrals)
         weight = max(env.circularity_weight, 1.0 / (1.0 + LARGEST_MULTIPLIER))
         self._least = (1.0 - weight) / weight
         self._integrals: Floats = np.full(len(env.network.services), self._least)
@@ -182,14 +184,20 @@ class Multipliers:
         self._integrals, prices = price_step(
             self._integrals, levels, self._min_service, self._rate, self._damping_gain, least=self._least
         )
-        highest = float(prices.max())
-        self._env.circularity_weight = 1.0 / (1.0 + highest)
-        self._env.service_factors = prices / highest if highest else np.ones_like(prices)
+        if len(prices):
+            highest = float(prices.max())
+            self._env.circularity_weight = 1.0 / (1.0 + highest)
+            self._env.service_factors = prices / highest if highest else np.ones_like(prices)
         if self._budgets:
             levels_of_budgets = budget_levels(self._budgets, np.asarray(accounts, dtype=np.float64), self._min_service)
             options = (self._min_service, self._rate, self._damping_gain, LEAST_BUDGET_PRICE)
             self._budget_integrals, budget_prices = price_step(self._budget_integrals, levels_of_budgets, *options)
-            self._env.account_charges = charges_of(self._env, self._budgets, budget_prices)
+            self._charge(budget_prices)
+
+    def _charge(self, budget_prices: Floats) -> None:
+        """Charge for accounts at the prices of budgets, beside what the environment charges for anyhow."""
+        if self._budgets:
+            self._env.account_charges = self._base_charges + charges_of(self._env, self._budgets, budget_prices)
 
     def save(self, folder: Path) -> None:
         """Write the weight, the factors and the integral parts to a checkpoint."""

@@ -66,6 +66,11 @@ class Aims:
         """The budgets, shape (budgets,)."""
         return np.array([*self.budgets.values()], dtype=np.float64)
 
+    @property
+    def sizes(self) -> Floats:
+        """What budgets are measured by: their sizes, or 1 where they are 0, shape (budgets,)."""
+        return np.abs(np.where(self.limits == 0.0, 1.0, self.limits))
+
     def with_lower_budgets(self, excess: Floats) -> Aims:
         """Return the aims with budgets that are lower by ``excess``, shape (budgets,)."""
         return replace(self, budgets=dict(zip(self.budgets, (self.limits - excess).tolist(), strict=True)))
@@ -110,6 +115,10 @@ def aims_of(network: Network, aim: Aim, at_most: Mapping[str, float] | None) -> 
             that are all 0, or a budget of the account that alone is kept low.
     """
     accounts = [account.id for account in network.accounts]
+    if not isinstance(aim, str | Mapping):
+        raise CirlError(f"aim: give '{CIRCULARITY}', an account, or {{name: weight}}, got {aim!r}")
+    if not isinstance(at_most, Mapping | None):
+        raise CirlError(f"at_most: give {{account: total}}, got {at_most!r}")
     weights = {aim: 1.0} if isinstance(aim, str) else dict(aim)
     for name, weight in weights.items():
         if name not in (CIRCULARITY, *accounts):
@@ -124,7 +133,7 @@ def aims_of(network: Network, aim: Aim, at_most: Mapping[str, float] | None) -> 
         if account not in accounts:
             raise CirlError(f"network '{network.name}': at_most: {unknown_name('account', account, accounts)}")
         _check_number(f"at_most: the budget of '{account}'", most)
-        if account == aim:
+        if account in weights and not any(weight for name, weight in weights.items() if name != account):
             raise CirlError(f"at_most: '{account}' is kept as low as can be already; leave out its budget, or the aim")
         budgets[accounts.index(account)] = float(most)
     charges = {accounts.index(name): float(w) for name, w in weights.items() if name != CIRCULARITY and w}

@@ -112,7 +112,7 @@ def prices(bound: Bound) -> Floats:
     network, budgets = bound.network, np.array([*bound.budget_prices.values()])
     # what a budget is worth at least: to exceed it by all of it is as bad as all that is aimed at
     scale = _scale(bound)
-    budgets = np.maximum(budgets, scale / np.maximum(np.abs(bound.aims.limits), np.finfo(float).tiny))
+    budgets = np.maximum(budgets, scale / bound.aims.sizes)
     services = np.zeros(len(network.services))
     if bound.min_service is not None:
         multipliers = -bound.certificate.under[len(bound.certificate.under) - len(services) :]

@@ -19,7 +19,7 @@ present states (certainty equivalence), or for several futures drawn from there,
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import field, replace
 from typing import Annotated
 
 import numpy as np
@@ -38,6 +38,7 @@ from cirl_marl.optimum.aims import Aim, aims_of
 from cirl_marl.optimum.draws import Prices
 from cirl_marl.optimum.futures import DrawnFutures
 from cirl_marl.optimum.options import check_margin, check_options, demanded_levels, starting_stocks, with_margin
+from cirl_marl.optimum.registry import is_of_circularity
 from cirl_marl.optimum.solver import Infeasible, SolverFailure
 from cirl_marl.optimum.window_planner import Future, WindowPlanner
 from cirl_marl.optimum.windows import EMPTY, Continuation, WindowPlan, WindowTask
@@ -49,6 +50,8 @@ LEAST_PRICE = 0.1
 WINDOW = 3
 """Decisions that a plan looks ahead where the network is disturbed, unless another number is asked for. What comes
 after them has its price, and nobody knows it: on paper_city and steel_japan longer windows did no better."""
+NOTABLE = 2e-3
+"""Part of a budget, or level of a service, by which a plan misses it and says so."""
 FIRST_SAMPLE, SAMPLES = 2**30, 256
 """First seed and number of the paths over which what is expected of their functions is averaged."""
 
@@ -68,18 +71,10 @@ class _Demands:
     """What services and budgets ask of some intervals."""
 
     deficit: Annotated[Floats | None, "least sum of levels, shape (services,); None if nothing is demanded"]
-    limits: Annotated[Floats, "highest totals, in parts of budgets; empty for none"]
-    charges: Annotated[Floats, "of totals, in parts of budgets; empty for none"]
-
-    def without(self, outlook: WindowPlan, after: int, later: float | None) -> _Demands:
-        """Return what is left if intervals of the ``outlook`` from ``after`` on do as it has them.
-
-        Where lacks are priced they deliver, for this sum alone, all that is wanted in ``later`` intervals.
-        """
-        later_levels = outlook.levels[after:].sum(axis=0) if later is None else later
-        deficit = None if self.deficit is None else self.deficit - later_levels
-        limits = self.limits - outlook.bookings[after:].sum(axis=0) if len(self.limits) else self.limits
-        return _Demands(deficit, limits, outlook.charges)
+    limits: Annotated[Floats, "highest totals, in parts of budgets; empty for none"] = field(
+        default_factory=lambda: EMPTY
+    )
+    charges: Annotated[Floats, "of totals, in parts of budgets; empty for none"] = field(default_factory=lambda: EMPTY)
 
 
 class MPC(Planner):
@@ -91,7 +86,8 @@ class MPC(Planner):
     service counts beyond its demand. A service that arcs make up for while nobody acts on them is planned in full, as
     they will supply it.
 
-    An ``aim`` and budgets are those of ``bound``: what past intervals booked the planned ones have no more of.
+    An ``aim`` and budgets are those of ``bound``: what past intervals booked the planned ones have no more of. Whether
+    a budget is kept depends on all that is to come, so that plans look to the end of the episode.
 
     In a disturbed network ``min_service`` is of the *expected* levels, and budgets of expected totals: what lacks in
     any interval, and all that is booked on budgeted accounts, is charged for at the multipliers of the plan for what is
@@ -124,7 +120,7 @@ class MPC(Planner):
                 ``service_weight``.
             service_weight: w ≥ 0; goes with the aim ``circularity``.
             aim: see ``bound``.
-            at_most: budgets, likewise.
+            at_most: budgets, likewise; in a certain network without a ``horizon``.
             degree: degree of the test polynomials; see ``bound``.
             replan: decisions carried out of each plan; None: 4, in a disturbed network 1.
             futures: how many are drawn at every decision in a disturbed network; None: one, in which all is as it is
@@ -140,9 +136,9 @@ class MPC(Planner):
         """
         check_options(service_weight, min_service, degree)
         check_margin(margin)
-        if prices is not None and (aim != CIRCULARITY or at_most):
+        if prices is not None and (not is_of_circularity(aim) or at_most):
             raise CirlError("prices are those of λ̄ and service: leave out aim and at_most")
-        if service_weight is not None and aim != CIRCULARITY:
+        if service_weight is not None and not is_of_circularity(aim):
             raise CirlError(f"service_weight goes with the aim '{CIRCULARITY}', not with {aim!r}; demand min_service")
         if futures is not None and replan not in (None, 1):
             raise CirlError(f"replan {replan}: of a plan for several futures only the first decision is carried out")
@@ -171,6 +167,8 @@ class MPC(Planner):
         self._aims = aims = aims_of(network, self._aim, self._at_most)
         self._levels = None if self._min_service is None else demanded_levels(network, self._min_service)
         self.note, self._env, is_disturbed = "", env, bool(network.disturbed)
+        if horizon is not None and aims.budgets and not is_disturbed:
+            raise CirlError(f"horizon {horizon}: whether a budget is kept depends on the whole episode; leave it out")
         self._horizon = (WINDOW if self._prices is None else 1) if horizon is None and is_disturbed else horizon
         self._replan = (1 if is_disturbed else 4) if replan is None else replan
         if self._prices is not None:
@@ -198,7 +196,22 @@ class MPC(Planner):
         self._look_ahead(range(env.num_envs))
         for copy in range(env.num_envs):
             self._plans.append(self._next(copy, None))
+            self._note_excess(self._plans[copy].window)
             progress((copy + 1) / env.num_envs)
+
+    def _note_excess(self, plan: WindowPlan | None) -> None:
+        """Say what a first plan exceeds of a budget, and what it lacks of a service beside one."""
+        if plan is None or not len(plan.task.limits):
+            return
+        network = self._env.network
+        excess = plan.bookings.sum(axis=0) - plan.task.limits
+        ids = [network.accounts[account].id for account in self._aims.budgets]
+        faults = [f"{part:.2%} more {id_}" for id_, part in zip(ids, excess.tolist(), strict=True) if part > NOTABLE]
+        if plan.task.demand is not None:
+            lacks = zip(network.services, (plan.task.demand - plan.level).tolist(), strict=True)
+            faults += [f"{lack:.4f} less of '{service.id}'" for service, lack in lacks if lack > NOTABLE]
+        if faults:
+            self.note = f"no plan was found that keeps services and budgets; this one has {', '.join(faults)}"
 
     def act(self, observations: Arrays) -> Arrays:
         """Return the next actions, from the current state of the environment that was started.
@@ -236,22 +249,28 @@ class MPC(Planner):
     def _solve_window(self, copy: int, rest: range, window: range, last: WindowPlan | None) -> WindowPlan:
         """Plan the ``window`` of what is left of the episode, the ``rest``."""
         state, steps = self._env.physical, self._env.network.episode.horizon
-        deficit = None if self._levels is None else self._levels * steps - state.service[:, copy]
-        limits = self._aims.limits - state.accounts[[*self._aims.budgets], copy]
-        limits /= self._planner.futures[0].budget_size
-        demands = _Demands(deficit, limits, EMPTY)
-        if is_priced := self._common_outlook is not None:  # no level is demanded, all that lacks has its price
-            deficit = deficit if deficit is None else np.full(len(deficit), float(len(rest)))
-            demands = _Demands(deficit, EMPTY, self._common_outlook.charges)
+        deficit, outlook = None, self._common_outlook
+        if self._levels is not None:
+            deficit = self._levels * steps - state.service[:, copy]
+        if outlook is None:
+            left = self._aims.limits - state.accounts[[*self._aims.budgets], copy]
+            demands = _Demands(deficit, left / self._aims.sizes)
+        else:  # no level is demanded, all that lacks has its price
+            deficit = None if deficit is None else np.full(len(deficit), float(len(rest)))
+            demands = _Demands(deficit, charges=outlook.charges)
         if last is None:
             self._outlooks.pop(copy, None)
         if len(window) == len(rest):
-            return self._plan(copy, window, demands, last)
-        if self._common_outlook is None and copy not in self._outlooks:
+            plan = self._plan(copy, window, demands, last)
+            is_limited = last is not None and len(demands.limits) > 0
+            return self._planner.better_of(plan, last) if is_limited and last is not None else plan
+        if outlook is None and copy not in self._outlooks:
             self._outlooks[copy] = self._plan(copy, rest, demands, None, is_outlook=True)
-        outlook = self._common_outlook or self._outlooks[copy]
-        after = window.stop - outlook.task.intervals.start
-        demands = demands.without(outlook, after, steps - window.stop if is_priced else None)
+        outlook = outlook or self._outlooks[copy]
+        if deficit is not None:
+            after = window.stop - outlook.task.intervals.start
+            later_levels = outlook.levels[after:].sum(axis=0) if self._common_outlook is None else steps - window.stop
+            demands = replace(demands, deficit=deficit - later_levels)
         later = outlook.continuation(window)
         if self._prices is not None:
             later = replace(later, costs=self._state_costs(later.costs, copy, window))
@@ -360,6 +379,6 @@ class MPC(Planner):
         """Return the plan of an episode in which all is as expected, from the middle of the initial ranges."""
         (future,), steps = self._planner.futures, range(self._env.network.episode.horizon)
         deficit = None if self._levels is None else self._levels * len(steps)
-        demands = _Demands(deficit, self._aims.limits / future.budget_size, EMPTY)
+        demands = _Demands(deficit, self._aims.limits / self._aims.sizes, EMPTY)
         stock = starting_stocks(future.admissible.lifetimes, None)
         return self._solve_task(self._planner, stock, steps, demands, None, is_outlook=True)

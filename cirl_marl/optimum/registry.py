@@ -35,6 +35,11 @@ FUTURES = 4
 """That ``scenario_mpc`` plans for, unless another number is asked for."""
 
 
+def is_of_circularity(aim: Aim) -> bool:
+    """Whether an aim has nothing but λ̄ in it."""
+    return aim == CIRCULARITY or (isinstance(aim, Mapping) and {*aim} == {CIRCULARITY})
+
+
 def named_controller(
     name: str,
     *,
@@ -74,9 +79,10 @@ def named_controller(
         raise CirlError(f"a margin goes with {', '.join(TUNABLE)} control, not with {name}")
     if futures is not None and name != "scenario_mpc":
         raise CirlError(f"futures go with scenario_mpc control, not with {name}")
-    if (aim != CIRCULARITY or at_most) and name not in WITH_AIMS:
+    has_aim = not is_of_circularity(aim)
+    if (has_aim or at_most) and name not in WITH_AIMS:
         raise CirlError(f"an aim and budgets of accounts go with {', '.join(WITH_AIMS)} control, not with {name}")
-    if aim != CIRCULARITY and min_service is None:
+    if has_aim and min_service is None:
         raise CirlError(f"aim {aim!r}: say which service is demanded beside it, as min_service, or it is least at none")
     if name == "optimum":
         from cirl_marl.optimum.mpc import SERVICE_FIRST

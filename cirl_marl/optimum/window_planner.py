@@ -62,6 +62,8 @@ ROUNDS, MOST_ROUNDS, LARGE_ROUNDS = 3, 10, 2
 whose outlooks the first will do."""
 FALLS_SHORT = 2e-3
 """By how much the simulator must not miss what a program promises, in λ̄/circularity_scale."""
+EXCEEDED = 1e-5
+"""Part of a budget by which what a plan books may differ from what was reckoned with, without a further round."""
 TOLERANCE = 2e-4
 """Level by which the intervals that are carried out may miss what is planned, in the mean, without a further round."""
 
@@ -110,7 +112,6 @@ class Future:
         self._shift = 0
         self.aims: Aims = aims if like is None else like.aims
         self._budgets = [*self.aims.budgets]
-        self.budget_size = np.where(self.aims.limits == 0, 1.0, np.abs(self.aims.limits))
         ledger = Ledger(network)
         self._raw_rates = ledger.rates(with_discount=False) if self.aims.charges or self._budgets else None
         self._discount: Floats = ledger.discount if like is None else like._discount
@@ -148,7 +149,7 @@ class Future:
             totals = account_rows(admissible.lifetimes, layout, task.stock, rates)[0].toarray()
             cost = -self.aims.objective(-cost, totals)
             if len(task.charges):
-                cost += (task.charges / self.budget_size) @ totals[self._budgets]
+                cost += (task.charges / self.aims.sizes) @ totals[self._budgets]
         cost = cost.reshape(steps, -1)
         if task.later is not None:
             cost += task.later.costs
@@ -187,8 +188,8 @@ class Future:
             return sparse.csr_array((0, len(problem.cost))), np.empty(0)
         totals, beside = account_rows(self.admissible.lifetimes, problem.layout, task.stock, rates)
         further = sparse.csr_array((len(self._budgets), len(problem.cost) - totals.shape[1]))
-        rows = sparse.diags_array(1.0 / self.budget_size) @ totals[self._budgets]
-        return sparse.hstack([rows, further], format="csr"), beside[self._budgets] / self.budget_size
+        rows = sparse.diags_array(1.0 / self.aims.sizes) @ totals[self._budgets]
+        return sparse.hstack([rows, further], format="csr"), beside[self._budgets] / self.aims.sizes
 
     def trial(self, problem: Program, plan: Floats, task: WindowTask) -> WindowTrial:
         """Carry a plan out in the simulator.
@@ -201,31 +202,43 @@ class Future:
         intervals, admissible, layout = self._places(task.intervals), self.admissible, problem.layout
         variables = plan[: len(intervals) * layout.size].reshape(len(intervals), -1)
         actions = normalised_actions(admissible, layout, variables, task.stock, intervals)
-        stocks, flows = self._simulator.run(task.stock, actions, intervals.start)
+        level, bookings, value = self.carry_out(task, actions)
         low = admissible.service_low[intervals.start : intervals.stop]
-        quantity = np.concatenate([stocks[1:], flows], axis=1) @ self._measure.T
-        level = np.divide(quantity, low, out=np.ones_like(low), where=low > 0)
         error = np.where(low > 0, np.clip(self._quantity(problem, plan, variables, low) - level, -1.0, 1.0), 0.0)
-        levels, bookings = np.minimum(level, 1.0), np.zeros((len(intervals), len(self._budgets)))
-        accounts, excess = np.zeros((0, len(intervals))), np.zeros_like(bookings)
-        if (rates := self._rates(task.intervals)) is not None:
-            rows = self._simulator.dynamics.rows
-            stores = rows.stocks(np.append(stocks, np.ones((len(stocks), 1)), axis=1).T).T
-            accounts = totals_over(rates, flows, stores)
-            bookings = (accounts[self._budgets] / self.budget_size[:, None]).T
+        excess = np.zeros_like(bookings)
+        if self._budgets:
             rows_of_totals, beside = self.booking_rows(problem, task)
             excess += (bookings.sum(axis=0) - rows_of_totals @ plan - beside) / len(intervals)
-        value = self._value(task, flows, stocks[-1], levels, accounts.sum(axis=1))
-        if len(task.charges):
-            value -= float(task.charges @ bookings.sum(axis=0))
         return WindowTrial(
             actions,
             value,
-            levels.mean(axis=0),
+            np.minimum(level, 1.0).mean(axis=0),
             Correction(error, excess, *self._factors(variables, intervals)),
             bookings,
             variables[:, layout.level : layout.imbalance],
         )
+
+    def carry_out(self, task: WindowTask, actions: Floats) -> tuple[Floats, Floats, float]:
+        """Return what the simulator makes of actions, shape (intervals, entries).
+
+        These are levels of services, more than 1 where there is too much, shape (intervals, services), what is booked
+        on budgeted accounts, in parts of budgets, shape (intervals, budgets), and the objective.
+        """
+        intervals = self._places(task.intervals)
+        stocks, flows = self._simulator.run(task.stock, actions, intervals.start)
+        low = self.admissible.service_low[intervals.start : intervals.stop]
+        quantity = np.concatenate([stocks[1:], flows], axis=1) @ self._measure.T
+        level = np.divide(quantity, low, out=np.ones_like(low), where=low > 0)
+        bookings, accounts = np.zeros((len(intervals), len(self._budgets))), np.zeros((0, len(intervals)))
+        if (rates := self._rates(task.intervals)) is not None:
+            rows = self._simulator.dynamics.rows
+            stores = rows.stocks(np.append(stocks, np.ones((len(stocks), 1)), axis=1).T).T
+            accounts = totals_over(rates, flows, stores)
+            bookings = (accounts[self._budgets] / self.aims.sizes[:, None]).T
+        value = self._value(task, flows, stocks[-1], np.minimum(level, 1.0), accounts.sum(axis=1))
+        if len(task.charges):
+            value -= float(task.charges @ bookings.sum(axis=0))
+        return level, bookings, value
 
     def _factors(self, variables: Floats, intervals: range) -> tuple[Floats, Floats]:
         """Return the rates and valves of a plan, the neutral ones where nothing flows; see ``Correction``."""
@@ -309,7 +322,7 @@ class WindowPlanner:
         trial = best = self._first_trial(task, basis)
         task = replace(task, corrections=trial.task.corrections)
         for done in range(1, MOST_ROUNDS + 1):
-            if trial.merit > best.merit:
+            if trial.merit > self._merit(best, trial.task.price):
                 best = trial
             promise = -float(trial.problem.cost @ trial.solution.plan)
             is_large = len(trial.problem.cost) >= LARGE_PROGRAM  # each program starts from nothing
@@ -317,11 +330,12 @@ class WindowPlanner:
             if (done >= ROUNDS and is_near) or (is_large and (task.is_outlook or done == LARGE_ROUNDS)):
                 break
             if task.corrections is not None:
-                pairs = zip(trial.corrections, task.corrections, strict=True)
+                pairs = [*zip(trial.corrections, task.corrections, strict=True)]
                 error = np.mean(
                     [(now.error - before.error)[:carried_out].mean(axis=0) for now, before in pairs], axis=0
                 )
-                if np.abs(error).max(initial=0.0) <= TOLERANCE:
+                excess = sum((now.excess - before.excess).sum(axis=0) for now, before in pairs) / len(pairs)
+                if np.abs(error).max(initial=0.0) <= TOLERANCE and np.abs(excess).max(initial=0.0) <= EXCEEDED:
                     break
             if done < MOST_ROUNDS:
                 task = replace(trial.task, corrections=trial.corrections)
@@ -338,9 +352,9 @@ class WindowPlanner:
                 trial = self._trial(task, basis, rises=0)
             except (Infeasible, SolverFailure):
                 return self._trial(replace(task, corrections=None), None)
-            slack_count = len(trial.solution.plan) - self._slack_count(task)
+            first = len(trial.solution.plan) - self._slack_count(task)
             is_priced = task.later is not None or task.is_redrawn
-            if is_priced or trial.solution.plan[slack_count:].max(initial=0.0) <= SHORTFALL:
+            if is_priced or trial.solution.plan[first:].max(initial=0.0) <= SHORTFALL:
                 return trial
             task, basis = replace(task, corrections=None), None
         return self._trial(task, basis)
@@ -359,16 +373,36 @@ class WindowPlanner:
         task, solution = self._solve(joint.problem, task, basis, rises)
         triples = zip(self.futures, parts, joint.columns, strict=True)
         trials = [future.trial(part, solution.plan[columns], task) for future, part, columns in triples]
-        merit, level = float(np.mean([t.value for t in trials])), np.mean([t.level for t in trials], axis=0)
-        bookings, budgets = np.mean([t.bookings for t in trials], axis=0), len(task.limits)
-        if budgets:
-            merit -= float(task.price[:budgets] @ np.maximum(0.0, bookings.sum(axis=0) - task.limits))
-        if task.demand is not None:
-            share = len(task.intervals) / self._horizon
-            merit -= float(task.price[budgets:] @ np.maximum(0.0, task.demand - level)) * share
+        value, level = float(np.mean([t.value for t in trials])), np.mean([t.level for t in trials], axis=0)
+        bookings = np.mean([t.bookings for t in trials], axis=0)
         promised = np.mean([trial.promised for trial in trials], axis=0)
         corrections = tuple(trial.correction for trial in trials)
-        return WindowPlan(task, joint.problem, solution, trials[0].actions, corrections, promised, bookings, merit)
+        reached = (promised, level, bookings, value)
+        plan = WindowPlan(task, joint.problem, solution, trials[0].actions, corrections, *reached, merit=0.0)
+        return replace(plan, merit=self._merit(plan, task.price))
+
+    def better_of(self, plan: WindowPlan, last: WindowPlan) -> WindowPlan:
+        """Return a plan, or in its place the rest of the ``last`` one if that does better at the same prices."""
+        actions = last.actions[plan.task.intervals.start - last.task.intervals.start :]
+        if len(actions) != len(plan.task.intervals):
+            return plan
+        level, bookings, value = self.futures[0].carry_out(plan.task, actions)
+        level = np.minimum(level, 1.0).mean(axis=0)
+        rest = replace(plan, actions=actions, level=level, bookings=bookings, value=value)
+        merit = self._merit(rest, plan.task.price)
+        return replace(rest, merit=merit) if merit > self._merit(plan, plan.task.price) else plan
+
+    def _merit(self, plan: WindowPlan, price: Floats) -> float:
+        """Return the objective of a plan, less what it exceeds and lacks at a price, shape (budgets + services,)."""
+        task, budgets, merit = plan.task, len(plan.task.limits), plan.value
+        if budgets:
+            merit -= float(price[:budgets] @ np.maximum(0.0, plan.bookings.sum(axis=0) - task.limits))
+        if task.demand is not None:
+            # beside budgets prices of service rise with theirs, and plans are compared at the same ones
+            price = price if budgets else task.price
+            share = len(task.intervals) / self._horizon
+            merit -= float(price[budgets:] @ np.maximum(0.0, task.demand - plan.level)) * share
+        return merit
 
     def _slack_count(self, task: WindowTask) -> int:
         """Return how many budgets and services have a variable for what is exceeded or lacks."""

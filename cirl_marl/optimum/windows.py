@@ -1,7 +1,7 @@
 """The program of some intervals of an episode: what is to be planned, and what its rows have beside those of a bound.
 
 A demanded level is no row that must hold but has a price, charged per unit that the episode lacks. A price above the
-multiplier of the demand is exact: nothing is slack_count that can be had.
+multiplier of the demand is exact: nothing is lacking that can be had.
 
 Reference: Kerrigan and Maciejowski 2000, UKACC Control (exact penalties in model predictive control).
 """
@@ -83,7 +83,9 @@ class WindowPlan:
     actions: Annotated[Floats, "normalised, in the first of the futures, shape (intervals, entries)"]
     corrections: Annotated[tuple[Correction, ...], "what became of it in each future"]
     levels: Annotated[Floats, "that the program promises on average, shape (intervals, services)"]
+    level: Annotated[Floats, "mean of each service that was reached, shape (services,)"]
     bookings: Annotated[Floats, "on budgeted accounts, on average, in parts of budgets, shape (intervals, budgets)"]
+    value: Annotated[float, "objective reached there, less what is left to later intervals"]
     merit: Annotated[float, "objective reached there, less what is left to later intervals and what service lacks"]
 
     @property

@@ -37,6 +37,8 @@ class EpisodePackage:
     """What a data package has of an episode."""
 
     network: Annotated[Network, "that moved"]
+    scenario: Annotated[str, "under which it did"]
+    control: Annotated[str, "who acted"]
     stock: Annotated[Floats, "stocks at the start and after each interval, shape (steps + 1, stores), mass"]
     flow: Annotated[Floats, "mean flows of each interval, shape (steps, arcs), mass/time"]
     levels: Annotated[Floats, "level of each service, shape (steps, services)"]
@@ -74,7 +76,8 @@ def write_package(folder: str | Path, simulation: Simulation) -> Path:
             "$schema": PROFILE,
             "name": network.name.replace("_", "-").lower(),
             "title": network.title or network.name,
-            "description": f"Scenario {network.scenario_name}, control {simulation.control}",
+            "scenario": network.scenario_name,
+            "control": simulation.control,
             "contributors": [{"title": f"cirl_marl {versions()['cirl-marl']}", "roles": ["creator"]}],
             "resources": resources,
         }
@@ -133,12 +136,13 @@ def read_package(folder: str | Path) -> EpisodePackage:
         CirlError: for a file that is missing or says something else; names the file, the row and what was expected.
     """
     folder = Path(folder)
-    resources = read_record(folder / PACKAGE).get("resources")
+    package = read_record(folder / PACKAGE)
+    resources = package.get("resources")
     names = [part.get("name") for part in resources if isinstance(part, dict)] if isinstance(resources, list) else []
     network = load_network(folder / DEFINITION)
 
     def table(name: str, columns: Sequence[str], ids: Sequence[str], first: int = 0) -> Floats:
-        """Return the numbers of a table by interval and the ids of a column; sums where ids come several times."""
+        """Return the numbers of a table by interval and the ids of a column."""
         if name not in names:
             raise CirlError(f"{folder / PACKAGE}: resources: {unknown_name('table', name, names)}")
         return _numbers(folder / f"{name}.csv", columns, ids, network.episode.horizon + first)
@@ -148,6 +152,8 @@ def read_package(folder: str | Path) -> EpisodePackage:
 
     return EpisodePackage(
         network,
+        str(package.get("scenario", network.scenario_name)),
+        str(package.get("control", "")),
         table("stocks", ("node", "stock"), ids(network.stores), 1),
         table("flows", ("arc", "flow"), ids(network.arcs)),
         table("services", ("service", "level"), ids(network.services)),
@@ -157,9 +163,12 @@ def read_package(folder: str | Path) -> EpisodePackage:
 
 
 def _numbers(path: Path, columns: Sequence[str], ids: Sequence[str], intervals: int) -> Floats:
-    """Return the numbers of a table, shape (intervals, ids)."""
+    """Return the numbers of a table, shape (intervals, ids); amounts on accounts are added up."""
+    if not path.is_file():
+        raise CirlError(f"{path}: no such file")
+    adds = columns[0] == "account"
     rows = CsvRows(str(path), read_content(path))
-    header, numbers = rows[0], np.full((intervals, len(ids)), np.nan)
+    header, numbers = rows[0], np.full((intervals, len(ids)), 0.0 if adds else np.nan)
     for column in filter(None, ("interval", *columns)):
         if column not in header:
             raise CirlError(f"{path}: {unknown_name('column', column, header)}")
@@ -175,7 +184,9 @@ def _numbers(path: Path, columns: Sequence[str], ids: Sequence[str], intervals: 
         if not np.isfinite(number):
             raise CirlError(f"{path}, line {line}: {columns[1]} {cell!r} is no finite number")
         place = int(interval), rank[id_]
-        numbers[place] = number if np.isnan(numbers[place]) else numbers[place] + number
+        if not adds and not np.isnan(numbers[place]):
+            raise CirlError(f"{path}, line {line}: {columns[1]} of {id_ or 'the network'} comes a second time")
+        numbers[place] = numbers[place] + number if adds else number
     if np.isnan(numbers).any():
         interval, place = np.argwhere(np.isnan(numbers))[0]
         raise CirlError(f"{path}: no {columns[1]} of {ids[place] or 'the network'} in interval {interval}")

@@ -10,6 +10,7 @@ References: Huppmann et al. 2021, pyam: Analysis and visualisation of integrated
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
@@ -33,12 +34,18 @@ def write_iamc(path: str | Path, simulations: Sequence[Simulation]) -> Path:
     """Write episodes as a CSV file in the IAMC format, and return its path.
 
     Raises:
-        CirlError: for a network whose intervals are no calendar years, or episodes of different years.
+        CirlError: for a network whose intervals are no calendar years, no episodes or those of different years, or two
+            rows of the same names.
     """
+    if not simulations:
+        raise CirlError("IAMC: give at least one episode")
     years = [_years(simulation.network) for simulation in simulations]
     if any(other != years[0] for other in years):
         raise CirlError("IAMC: the episodes are of different years; write a file for each")
     rows = [[*names, *values.tolist()] for simulation in simulations for names, values in _series(simulation)]
+    for names, times in Counter(tuple(row[:4]) for row in rows).items():
+        if times > 1:
+            raise CirlError(f"IAMC: {', '.join(map(str, names))} would come {times} times; give other titles")
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, lambda draft: write_table(draft, [*NAMES, *map(str, years[0])], rows))
@@ -64,6 +71,8 @@ def read_iamc(path: str | Path) -> list[YearlyValues]:
         CirlError: for a missing column, one that is no year, a cell that is no number, or a row that comes twice; names
             the file and the line.
     """
+    if not Path(path).is_file():
+        raise CirlError(f"{path}: no such file")
     rows = CsvRows(str(path), read_content(Path(path)))
     header = [cell.strip() for cell in rows[0]]
     columns = {cell.lower(): place for place, cell in enumerate(header)}
@@ -74,8 +83,13 @@ def read_iamc(path: str | Path) -> list[YearlyValues]:
     years = {place: cell for place, cell in enumerate(header) if place not in places}
     if wrong := [cell for cell in years.values() if not (cell.isdecimal() and len(cell) == 4)]:
         raise CirlError(f"{path}: column '{wrong[0]}' is no year, such as 2030, and none of {', '.join(NAMES)}")
+    if len({*years.values()}) < len(years):
+        twice = next(year_ for year_, times in Counter(years.values()).items() if times > 1)
+        raise CirlError(f"{path}: column '{twice}' comes a second time")
     table: dict[tuple[str, ...], YearlyValues] = {}
     for line, cells in zip(rows.lines[1:], rows[1:], strict=True):
+        if not any(cell.strip() for cell in cells):
+            continue
         values = {int(year_): number_in(cells[place]) for place, year_ in years.items() if cells[place].strip()}
         if not all(map(math.isfinite, values.values())):
             at = next(year_ for year_, value in values.items() if not math.isfinite(value))
@@ -103,7 +117,7 @@ def _series(simulation: Simulation) -> Iterator[tuple[list[str], Floats]]:
     """Give the first columns of each row, and its values, shape (steps,)."""
     network, run, ledger = simulation.network, simulation.rollout, simulation.env.ledger
     model, mass = f"cirl_marl {versions()['cirl-marl']}", network.mass_unit
-    scenario = f"{network.scenario_name} {simulation.control}"
+    scenario = f"{network.name} {network.scenario_name} {simulation.control}"
     own = network.region or WORLD
     scale = elapsed_time(2001, 2000, network.time_unit)
     regions = {node: region for region, nodes in network.copies.items() for node in nodes}
