@@ -448,6 +448,11 @@ CIRCULARITY = "circularity"
 """What plans aim at that is no account."""
 
 
+def is_of_circularity(aim: object) -> bool:
+    """Whether an aim, a name or weights by name, has nothing but λ̄ in it."""
+    return aim == CIRCULARITY or (isinstance(aim, Mapping) and {*aim} == {CIRCULARITY})
+
+
 @frozen_record
 class Account(CheckedRecord):
     """What is counted beside mass, such as money, emissions or energy, under an ``id`` of its own.

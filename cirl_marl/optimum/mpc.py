@@ -30,7 +30,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, ControlError, whole_number
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record
-from cirl_marl.network.elements import CIRCULARITY
+from cirl_marl.network.elements import CIRCULARITY, is_of_circularity
 from cirl_marl.network.innovations import innovations
 from cirl_marl.network.uncertainty import expected_network
 from cirl_marl.optimum.admissible import Admissible
@@ -38,7 +38,6 @@ from cirl_marl.optimum.aims import Aim, aims_of
 from cirl_marl.optimum.draws import Prices
 from cirl_marl.optimum.futures import DrawnFutures
 from cirl_marl.optimum.options import check_margin, check_options, demanded_levels, starting_stocks, with_margin
-from cirl_marl.optimum.registry import is_of_circularity
 from cirl_marl.optimum.solver import Infeasible, SolverFailure
 from cirl_marl.optimum.window_planner import Future, WindowPlanner
 from cirl_marl.optimum.windows import EMPTY, Continuation, WindowPlan, WindowTask

@@ -12,7 +12,7 @@ from cirl_marl.controllers.basic import Constant, Controller, Neutral, Random
 from cirl_marl.controllers.lqr import LQR
 from cirl_marl.controllers.scripted import ScriptController
 from cirl_marl.errors import CirlError, unknown_name
-from cirl_marl.network.elements import CIRCULARITY
+from cirl_marl.network.elements import CIRCULARITY, is_of_circularity
 
 if TYPE_CHECKING:
     from cirl_marl.optimum.aims import Aim
@@ -33,11 +33,6 @@ TUNABLE = ("scripted", "mpc", *UNCERTAIN)
 """Controllers with a margin on what they aim at."""
 FUTURES = 4
 """That ``scenario_mpc`` plans for, unless another number is asked for."""
-
-
-def is_of_circularity(aim: Aim) -> bool:
-    """Whether an aim has nothing but λ̄ in it."""
-    return aim == CIRCULARITY or (isinstance(aim, Mapping) and {*aim} == {CIRCULARITY})
 
 
 def named_controller(

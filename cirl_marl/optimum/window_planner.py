@@ -322,7 +322,8 @@ class WindowPlanner:
         trial = best = self._first_trial(task, basis)
         task = replace(task, corrections=trial.task.corrections)
         for done in range(1, MOST_ROUNDS + 1):
-            if trial.merit > self._merit(best, trial.task.price):
+            # beside budgets prices of service rise with theirs, and plans are compared at the same ones
+            if trial.merit > (self._merit(best, trial.task.price) if len(task.limits) else best.merit):
                 best = trial
             promise = -float(trial.problem.cost @ trial.solution.plan)
             is_large = len(trial.problem.cost) >= LARGE_PROGRAM  # each program starts from nothing
@@ -398,8 +399,6 @@ class WindowPlanner:
         if budgets:
             merit -= float(price[:budgets] @ np.maximum(0.0, plan.bookings.sum(axis=0) - task.limits))
         if task.demand is not None:
-            # beside budgets prices of service rise with theirs, and plans are compared at the same ones
-            price = price if budgets else task.price
             share = len(task.intervals) / self._horizon
             merit -= float(price[budgets:] @ np.maximum(0.0, task.demand - plan.level)) * share
         return merit
