@@ -285,6 +285,13 @@ def test_what_is_kept_is_whole_and_small() -> None:
     assert {path.name for path in (PACKAGE_DATA / "bounds").iterdir()} == bounds
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("row", ["steel_japan-v1/mpc", "car_batteries.adoption-v0/mpc", "paper_city-v0/best_schedule"])
+def test_rows_of_controllers_are_still_what_they_do(row: str) -> None:
+    """Plans depend on every box of their programs, down to the digits that rows have."""
+    assert verify(ids=[row]) == [row]
+
+
 def test_pretrained_policies_come_with_the_package() -> None:
     """A kept policy acts in its task as its row says, and no learner is far below the bound unnoticed."""
     (id_,) = verify(ids=[f"{TASK}/exact_gradients/401"])

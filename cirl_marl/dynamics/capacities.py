@@ -14,7 +14,7 @@ import numpy as np
 from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.dynamics.uncertain_factors import RowFactors
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.network.rowsum import RowSum, single_column
+from cirl_marl.network.rowsum import RowSum
 from cirl_marl.network.uncertainty import numbers_of
 
 
@@ -82,5 +82,5 @@ class Capacities:
     def _rates_in(self, step: Integers | None) -> Floats:
         """Return c in the interval of each copy, in the first one without it."""
         if step is None or self._rates.shape[1] == 1:
-            return single_column(self._rates)[:, :1]
+            return self._rates[:, :1]
         return self._rates.take(step, axis=1)

@@ -145,7 +145,8 @@ class MultiAgentVectorEnv:
         self.idle = self.supply.idle(self.agents)
         self._credit = Credit(self.dynamics, self.supply, self.scoring, self.agents, self.reward_mode, moment)
         charges = {} if charges is None else charges
-        self.account_charges = [charges.get(account, 0.0) for account in self._accounts(charges)]
+        self._check_charges(charges)
+        self.account_charges = [charges.get(account, 0.0) for account in self.ledger.accounts]
         self.observation_names = self.layout.names
         self._starts = Starts(variant, self.dynamics, num_envs, self.layout.array_order)
         self.rows = self.dynamics.rows
@@ -200,8 +201,8 @@ class MultiAgentVectorEnv:
             raise CirlError(f"charges must be finite numbers, one for each account, got {charges!r}")
         self._credit.charges = values
 
-    def _accounts(self, charges: Mapping[str, float]) -> tuple[str, ...]:
-        """Return the accounts; refuse charges of others, or in rewards that have no λ."""
+    def _check_charges(self, charges: Mapping[str, float]) -> None:
+        """Refuse charges of what is no account, that are no numbers, or in rewards that have no λ."""
         if not isinstance(charges, Mapping):
             raise CirlError(f"charges: give {{account: number}}, got {charges!r}")
         for account, charge in charges.items():
@@ -212,7 +213,6 @@ class MultiAgentVectorEnv:
                 raise CirlError(f"network '{self.network.name}': charges: {fault}")
         if any(charges.values()) and self.reward_mode in ("local", "local_sum"):
             raise CirlError(f"charges count in rewards with λ, not in '{self.reward_mode}'")
-        return self.ledger.accounts
 
     @property
     def is_random(self) -> bool:

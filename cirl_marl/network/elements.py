@@ -449,8 +449,8 @@ CIRCULARITY = "circularity"
 
 
 def is_of_circularity(aim: object) -> bool:
-    """Whether an aim, a name or weights by name, has nothing but λ̄ in it."""
-    return aim == CIRCULARITY or (isinstance(aim, Mapping) and {*aim} == {CIRCULARITY})
+    """Whether an aim, a name or weights by name, is λ̄."""
+    return aim in (CIRCULARITY, {CIRCULARITY: 1.0})
 
 
 @frozen_record

@@ -261,8 +261,7 @@ class MPC(Planner):
             self._outlooks.pop(copy, None)
         if len(window) == len(rest):
             plan = self._plan(copy, window, demands, last)
-            is_limited = last is not None and len(demands.limits) > 0
-            return self._planner.better_of(plan, last) if is_limited and last is not None else plan
+            return plan if last is None or not len(demands.limits) else self._planner.better_of(plan, last)
         if outlook is None and copy not in self._outlooks:
             self._outlooks[copy] = self._plan(copy, rest, demands, None, is_outlook=True)
         outlook = outlook or self._outlooks[copy]

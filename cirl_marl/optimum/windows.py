@@ -228,12 +228,12 @@ class JointProgram:
                 low=low,
                 high=high,
             )
-        slack_count = 0
+        most = EMPTY  # that budgets may be exceeded by, and services lack
         if len(limits):
-            totals = sum((rows @ place / count for rows, place in zip(bookings, places, strict=True)))
+            totals = sum(rows @ place / count for rows, place in zip(bookings, places, strict=True))
+            most = np.maximum(abs(totals) @ np.maximum(np.abs(problem.low), np.abs(problem.high)) - limits, 0.0)
             under = sparse.vstack([problem.under, totals], format="csr")
             problem = replace(problem, under=under, under_to=np.append(problem.under_to, limits))
-            slack_count = len(limits)
         if demand is not None and len(demand):
             levels = [level_columns(part) for part in parts]
             weight = -1.0 / (len(levels[0]) // len(demand) * count)
@@ -245,24 +245,20 @@ class JointProgram:
             means.sort_indices()
             under = sparse.vstack([problem.under, means], format="csr")
             problem = replace(problem, under=under, under_to=np.append(problem.under_to, -demand))
-            slack_count += len(demand)
-        return cls(with_lack(problem, slack_count), tuple(parts), columns)
+            most = np.append(most, np.maximum(demand, 0.0) + 1.0)  # levels are at least −1
+        return cls(with_lack(problem, most) if len(most) else problem, tuple(parts), columns)
 
 
-def with_lack(problem: Program, slack_count: int) -> Program:
-    """Return the program in which the last rows of G may lack something, one variable each."""
-    if not slack_count:
-        return problem
-    rows = len(problem.under_to)
+def with_lack(problem: Program, most: Floats) -> Program:
+    """Return the program in which the last rows of G may lack something, at ``most`` so much, one variable each."""
+    rows, slack_count = len(problem.under_to), len(most)
     lack = -sparse.eye_array(rows, slack_count, k=slack_count - rows, format="csr")
     empty = sparse.csr_array((len(problem.equal_to), slack_count))
-    last = problem.under[rows - slack_count :]
-    most = np.abs(last) @ np.maximum(np.abs(problem.low), np.abs(problem.high)) - problem.under_to[rows - slack_count :]
     return replace(
         problem,
         cost=np.append(problem.cost, np.zeros(slack_count)),
         equal=sparse.hstack([problem.equal, empty], format="csr"),
         under=sparse.hstack([problem.under, lack], format="csr"),
         low=np.append(problem.low, np.zeros(slack_count)),
-        high=np.append(problem.high, np.maximum(most, 0.0)),
+        high=np.append(problem.high, most),
     )
