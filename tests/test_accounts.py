@@ -61,6 +61,9 @@ from cirl_marl.optimum import bound, improve, improve_plan, simulate_plan, smoot
 from cirl_marl.optimum.aims import Aims
 from cirl_marl.optimum.linearised import jacobians, step_program
 from cirl_marl.optimum.program import Programs
+from cirl_marl.optimum.solver import Basis
+from cirl_marl.optimum.window_planner import WindowPlanner
+from cirl_marl.optimum.windows import WindowPlan, WindowTask
 from cirl_marl.report.data_package import read_package, write_package
 from cirl_marl.report.iamc import read_iamc, write_iamc
 from cirl_marl.report.lever_chart import levers_table, write_levers
@@ -429,11 +432,7 @@ def test_plans_are_compared_by_what_they_exceed() -> None:
     network = city().with_options(episode={"horizon": 30})
     least = -bound(network, aim="emissions", min_service=0.95).objective
     control = MPC(min_service=0.95, at_most={"emissions": 0.8 * least})
-    env = MultiAgentVectorEnv(network, num_envs=1)
-    env.reset(seed=0)
-    control.start(env, 0)
-    plan = control._plans[0].window
-    assert plan is not None
+    plan = first_window(control, network)
     assert "less of 'paper_delivered'" in control.note
     merit, booked_parts = control._planner._merit, plan.bookings.sum(axis=0)
     assert plan.merit == pytest.approx(merit(plan, plan.task.price))
@@ -445,6 +444,65 @@ def test_plans_are_compared_by_what_they_exceed() -> None:
     charged = replace(plan.task, charges=np.array([50.0]))
     values = [future.carry_out(task, plan.actions)[2] for task in (plan.task, charged)]
     assert values[0] - values[1] == pytest.approx(50.0 * float(plan.bookings.sum()))
+
+
+def first_window(control: MPC, network: Network) -> WindowPlan:
+    """Return the first plan of the first copy."""
+    env = MultiAgentVectorEnv(network, num_envs=1)
+    env.reset(seed=0)
+    control.start(env, 0)
+    plan = control._plans[0].window
+    assert plan is not None
+    return plan
+
+
+def test_the_rest_of_a_plan_stays_where_a_new_one_is_worse() -> None:
+    """And is left for one that is better, at the price of what either exceeds."""
+    network = city().with_options(episode={"horizon": 30})
+    control = MPC(min_service=0.95, at_most={"emissions": halfway(network)})
+    plan = first_window(control, network)
+    idle = np.full_like(plan.actions, -1.0)
+    level, bookings, value = control._planner.futures[0].carry_out(plan.task, idle)
+    worse = replace(plan, actions=idle, level=np.minimum(level, 1.0).mean(axis=0), bookings=bookings, value=value)
+    assert (control._planner.better_of(worse, plan).actions == plan.actions).all()
+    assert control._planner.better_of(plan, worse) is plan
+
+
+@pytest.mark.parametrize("changes", [True, False])
+def test_budgets_ask_for_further_rounds(monkeypatch: pytest.MonkeyPatch, changes: bool) -> None:
+    """As long as what is booked beyond the program changes, ten programs are solved where plans keep little of it."""
+    trial, rounds = WindowPlanner._trial, list[int]()
+
+    def erring(planner: WindowPlanner, task: WindowTask, basis: Basis | None, rises: int = 8) -> WindowPlan:
+        plan = trial(planner, task, basis, rises)
+        rounds.append(len(rounds))
+        more = 0.001 * len(rounds) if changes else 0.001
+        parts = [replace(part, error=0 * part.error, excess=0 * part.excess + more) for part in plan.corrections]
+        return replace(plan, value=plan.value - 1e6, merit=plan.merit - 1e6, corrections=tuple(parts))
+
+    monkeypatch.setattr(WindowPlanner, "_trial", erring)
+    network = city().with_options(episode={"horizon": 6})
+    first_window(MPC(min_service=0.5, at_most={"emissions": 1e3}), network)
+    assert len(rounds) == (10 if changes else 2)
+
+
+def test_plans_at_different_prices_are_compared_at_the_higher(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A first one that exceeds its budget a little at a low price is no better than a second that keeps it."""
+    trial, plans = WindowPlanner._trial, list[WindowPlan]()
+
+    def told(planner: WindowPlanner, task: WindowTask, basis: Basis | None, rises: int = 8) -> WindowPlan:
+        plan, is_first = trial(planner, task, basis, rises), not plans
+        price = np.array([1.0, 1.0]) if is_first else np.array([100.0, 1.0])
+        bookings = np.zeros_like(plan.bookings)
+        bookings[0] = task.limits + (0.1 if is_first else 0.0)
+        reached: dict[str, Any] = {"bookings": bookings, "level": np.ones(1), "value": 0.0 if is_first else -1.0}
+        plan = replace(plan, task=replace(plan.task, price=price), **reached)
+        plans.append(replace(plan, merit=planner._merit(plan, price)))
+        return plans[-1]
+
+    monkeypatch.setattr(WindowPlanner, "_trial", told)
+    chosen = first_window(MPC(min_service=0.5, at_most={"emissions": 1e3}), city().with_options(episode={"horizon": 6}))
+    assert plans[0].merit > plans[1].merit and chosen.value == -1.0
 
 
 def test_mpc_in_a_disturbed_network_charges_for_budgets() -> None:

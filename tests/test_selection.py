@@ -204,6 +204,15 @@ def test_budgets_come_beside_charges_and_without_services() -> None:
     assert env.account_charges[1] == before[1] == 3.0 and env.circularity_weight == weight
 
 
+def test_budgets_move_in_a_training_without_services() -> None:
+    """Prices are charged as evaluations have it."""
+    network = replace(booked(load_network("paper_city").with_options(episode={"horizon": HORIZON}), 3), services=())
+    given = recipe(min_service=0.9, price_rate=1.0, at_most={"cost": 1.0})
+    training = train(network, given)
+    first = 0.1 * network.objective.circularity_scale
+    assert training.env.account_charges[0] not in (0.0, pytest.approx(first)) and training.env.account_charges[1] == 0
+
+
 def test_a_checkpoint_that_exceeds_a_budget_is_no_better() -> None:
     """Whatever its λ̄; of those that all lack something the one that lacks least is best."""
     budgets = {"cost": 100.0}
