@@ -156,20 +156,6 @@ def rates_over(network: Network, intervals: range) -> RateTables:
     return by_flow[:, period], by_stock[:, period]
 
 
-def totals_over(rates: RateTables, flow: Floats, stock: Floats) -> Floats:
-    """Return what each interval books on each account, shape (accounts, intervals).
-
-    Args:
-        rates: over the intervals.
-        flow: mean flows, shape (intervals, arcs), mass/time.
-        stock: at the start and after each interval, shape (intervals + 1, stores), mass.
-    """
-    by_flow, by_stock = rates
-    mean_stock = (stock[:-1] + stock[1:]) / 2
-    bookings: Floats = np.einsum("atk,tk->at", by_flow, flow) + np.einsum("atk,tk->at", by_stock, mean_stock)
-    return bookings
-
-
 def account_rows(
     lifetimes: Lifetimes, layout: Layout, initial: Floats, rates: RateTables
 ) -> tuple[sparse.csr_array, Floats]:

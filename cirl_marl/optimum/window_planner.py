@@ -34,7 +34,7 @@ from cirl_marl.dynamics.ledger import Ledger
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
-from cirl_marl.optimum.aims import NO_AIMS, Aims, RateTables, account_rows, totals_over
+from cirl_marl.optimum.aims import NO_AIMS, Aims, RateTables, account_rows
 from cirl_marl.optimum.constraints import held_controls
 from cirl_marl.optimum.matrices import IntervalCache, Layout, ProgramRows
 from cirl_marl.optimum.program import Program, Programs
@@ -42,6 +42,7 @@ from cirl_marl.optimum.solver import LARGE_PROGRAM, Basis, Infeasible, Solution,
 from cirl_marl.optimum.window_simulator import WindowSimulator, service_measures
 from cirl_marl.optimum.windows import (
     DISTANCE,
+    EMPTY,
     Continuation,
     Correction,
     JointProgram,
@@ -112,9 +113,11 @@ class Future:
         self._shift = 0
         self.aims: Aims = aims if like is None else like.aims
         self._budgets = [*self.aims.budgets]
-        ledger = Ledger(network)
-        self._raw_rates = ledger.rates(with_discount=False) if self.aims.charges or self._budgets else None
-        self._discount: Floats = ledger.discount if like is None else like._discount
+        self._ledger, self._discount = None, EMPTY
+        if self.aims.charges or self._budgets:
+            self._ledger = Ledger(network)
+            self._discount = self._ledger.discount if like is None else like._discount
+            self._rate_tables: RateTables = self._ledger.rates(with_discount=False)
         if like is None:
             self._programs = Programs(admissible, degree, service_weight, constant_shares=False)
         else:
@@ -172,10 +175,10 @@ class Future:
 
     def _rates(self, intervals: range) -> RateTables | None:
         """Return the rates of the accounts, discounted as in the episode; None if nothing is aimed at there."""
-        if self._raw_rates is None:
+        if self._ledger is None:
             return None
         places, discount = self._places(intervals), self._discount[:, intervals.start : intervals.stop, None]
-        by_flow, by_stock = (rates[:, places.start : places.stop] * discount for rates in self._raw_rates)
+        by_flow, by_stock = (rates[:, places.start : places.stop] * discount for rates in self._rate_tables)
         return by_flow, by_stock
 
     def booking_rows(self, problem: Program, task: WindowTask) -> tuple[Any, Floats]:
@@ -230,10 +233,12 @@ class Future:
         quantity = np.concatenate([stocks[1:], flows], axis=1) @ self._measure.T
         level = np.divide(quantity, low, out=np.ones_like(low), where=low > 0)
         bookings, accounts = np.zeros((len(intervals), len(self._budgets))), np.zeros((0, len(intervals)))
-        if (rates := self._rates(task.intervals)) is not None:
-            rows = self._simulator.dynamics.rows
-            stores = rows.stocks(np.append(stocks, np.ones((len(stocks), 1)), axis=1).T).T
-            accounts = totals_over(rates, flows, stores)
+        if self._ledger is not None:  # whose copies are the intervals here
+            stores = self._simulator.dynamics.rows.stocks(np.append(stocks, np.ones((len(stocks), 1)), axis=1).T)
+            entries = self._ledger.entries(
+                np.ascontiguousarray(flows.T), stores[:, :-1], stores[:, 1:], np.array(intervals)
+            )
+            accounts = self._ledger.sums(entries) * self._discount[:, task.intervals.start : task.intervals.stop]
             bookings = (accounts[self._budgets] / self.aims.sizes[:, None]).T
         value = self._value(task, flows, stocks[-1], np.minimum(level, 1.0), accounts.sum(axis=1))
         if len(task.charges):
