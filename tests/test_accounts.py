@@ -972,6 +972,38 @@ def test_the_command_writes_a_data_package(tmp_path: Path) -> None:
         assert isinstance(refused.exception, CirlError) and message in str(refused.exception)
 
 
+def test_what_no_file_holds_is_refused_before_anything_is_simulated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Names of files, years and titles are known before an episode is."""
+    monkeypatch.setattr("cirl_marl.evaluation.simulations.rollout", None)
+    (tmp_path / "file").touch()
+    iamc, japan, twice = str(tmp_path / "iamc.csv"), ["steel_japan"], tmp_path / "twice.toml"
+    network = load_network("steel_japan")
+    write_network(replace(network, accounts=(replace(network.accounts[0], title="Circularity"),)), twice)
+    for arguments, message in (
+        ([*japan, "--iamc", "iamc.xlsx"], "--iamc iamc.xlsx: needs the name of a .csv file"),
+        ([*japan, "--iamc", str(tmp_path / "file" / "iamc.csv")], "file is a file, not a folder"),
+        (["paper_city", "--iamc", iamc], "IAMC has calendar years; give"),
+        ([str(twice), "--iamc", iamc], "Circularity would come 2 times; give other titles"),
+        ([*japan, "--package", str(tmp_path / "file" / "data")], "file is a file, not a folder"),
+    ):
+        refused = CliRunner().invoke(app, ["simulate", *arguments, "--out", str(tmp_path)])
+        assert isinstance(refused.exception, CirlError) and message in str(refused.exception)
+    assert {path.name for path in tmp_path.iterdir()} == {"file", "twice.toml"}
+
+
+def test_the_command_writes_years_of_scenarios_and_controls(tmp_path: Path) -> None:
+    """Of as many steps as are asked for."""
+    path, controls = tmp_path / "iamc.csv", ["--control", "neutral", "--control", "random"]
+    options = ["--steps", "2", "--out", str(tmp_path), "--iamc", str(path)]
+    done = CliRunner().invoke(app, ["simulate", "steel_japan", *controls, *options])
+    assert done.exit_code == 0, done.output
+    rows = read_iamc(path)
+    assert {row.scenario for row in rows} == {"steel_japan default neutral", "steel_japan default random"}
+    assert {tuple(row.values) for row in rows} == {(2025, 2026)}
+
+
 def _size(simulation: Simulation) -> int:
     network = simulation.network
     parts = {(simulation.env.ledger.account[e], c) for e, c in enumerate(simulation.env.ledger.compartments)}

@@ -161,13 +161,16 @@ def writable_folder(path: Path, option: str) -> Path:
 
 def page_for(path: Path | None) -> Path | None:
     """Return where a report for the browser goes, if it is asked for; a ``CirlError`` says why it cannot go there."""
-    if path is None:
-        return None
-    if path.suffix != ".html":
-        raise CirlError(f"--html {path}: needs the name of an .html file")
+    return None if path is None else file_for(path, "--html", ".html")
+
+
+def file_for(path: Path, option: str, suffix: str) -> Path:
+    """Return where a file goes; a ``CirlError`` names the option if it has another ``suffix`` or cannot go there."""
+    if path.suffix != suffix:
+        raise CirlError(f"{option} {path}: needs the name of {'an' if suffix == '.html' else 'a'} {suffix} file")
     if path.is_dir():
-        raise CirlError(f"--html {path}: is a folder, not a file")
-    _check_writable(path, f"--html {path}")
+        raise CirlError(f"{option} {path}: is a folder, not a file")
+    _check_writable(path, f"{option} {path}")
     return path
 
 

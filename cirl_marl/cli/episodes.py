@@ -62,16 +62,26 @@ def simulate(
             raise CirlError("--iamc and --package go without --samples")
         _sample(network, scenario or [None], controls, steps, 0 if seed is None else seed, samples, out, page)
         return
+    from cirl_marl.definitions.catalogue import load_network
     from cirl_marl.evaluation.simulations import simulate_alternatives
 
     if package is not None and (len(controls) > 1 or len(scenario or ()) > 1):
         raise CirlError("--package holds one episode: give one scenario and one control")
-    if package is not None and package.exists():
+    if package is not None and common.writable_folder(package, "--package").exists():
         raise CirlError(f"--package {package}: exists; a data package is a folder of its own, so give another name")
     constants, folder = _constants(controls, set_ or []), common.folder_for(out or Path(), "--out")
+    definition = load_network(network)
+    scenarios: Sequence[str | None] = scenario or [None]
+    if iamc is not None:
+        from cirl_marl.report.iamc import iamc_years, write_iamc
+
+        common.file_for(iamc, "--iamc", ".csv")
+        changes = {} if steps is None else {"episode": {"horizon": steps}}
+        variants = [definition.scenario(name).with_options(**changes) for name in scenarios]
+        iamc_years([(variant, name) for variant in variants for name in controls])
     options: dict[str, Any] = {"controls": controls, "constants": constants, "steps": steps, "seed": seed}
     with common.bar("simulating") as progress:
-        found = simulate_alternatives(network, scenarios=scenario or [None], **options, progress=progress)
+        found = simulate_alternatives(definition, scenarios=scenarios, **options, progress=progress)
     files = {common.stem(simulation.network, simulation.control): simulation for simulation in found}
     if len(found) == 1:
         _write_one(folder, files)
@@ -79,8 +89,6 @@ def simulate(
         _write_several(folder, files)
     paths = common.browser_report(page, found)
     if iamc is not None:
-        from cirl_marl.report.iamc import write_iamc
-
         paths = [*paths, write_iamc(iamc, found)]
     if package is not None:
         from cirl_marl.report.data_package import write_package

@@ -11,11 +11,16 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
+
+from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.definitions.data_files import CsvRows, number_in
+from cirl_marl.dynamics.ledger import Ledger
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.network import Floats, Network
@@ -28,28 +33,44 @@ from cirl_marl.records.machine import versions
 WORLD = "World"
 """The region of what is of no copy and no region."""
 NAMES = ("Model", "Scenario", "Region", "Variable", "Unit")
+YearlyRow = tuple[list[str], Callable[[Rollout], Floats]]
+"""The first columns of a row, and what its values are of an episode, shape (steps,)."""
 
 
 def write_iamc(path: str | Path, simulations: Sequence[Simulation]) -> Path:
     """Write episodes as a CSV file in the IAMC format, and return its path.
 
     Raises:
+        CirlError: what ``iamc_years`` raises.
+    """
+    path, years = Path(path), iamc_years([(simulation.network, simulation.control) for simulation in simulations])
+    rows = [
+        [*names, *values(simulation.rollout).tolist()]
+        for simulation in simulations
+        for names, values in _series(simulation.network, simulation.control)
+    ]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, lambda draft: write_table(draft, [*NAMES, *map(str, years)], rows))
+    return path
+
+
+def iamc_years(episodes: Sequence[tuple[Network, str]]) -> range:
+    """Return the years of episodes, of which networks and names of controls are known, or say why no file holds them.
+
+    Raises:
         CirlError: for a network whose intervals are no calendar years, no episodes or those of different years, or two
             rows of the same names.
     """
-    if not simulations:
+    if not episodes:
         raise CirlError("IAMC: give at least one episode")
-    years = [_years(simulation.network) for simulation in simulations]
-    if any(other != years[0] for other in years):
+    first, *others = (_years(network) for network, _ in episodes)
+    if any(other != first for other in others):
         raise CirlError("IAMC: the episodes are of different years; write a file for each")
-    rows = [[*names, *values.tolist()] for simulation in simulations for names, values in _series(simulation)]
-    for names, times in Counter(tuple(row[:4]) for row in rows).items():
+    rows = [tuple(names[:4]) for network, control in episodes for names, _ in _series(network, control)]
+    for names, times in Counter(rows).items():
         if times > 1:
-            raise CirlError(f"IAMC: {', '.join(map(str, names))} would come {times} times; give other titles")
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, lambda draft: write_table(draft, [*NAMES, *map(str, years[0])], rows))
-    return path
+            raise CirlError(f"IAMC: {', '.join(names)} would come {times} times; give other titles")
+    return first
 
 
 @positional_record
@@ -101,7 +122,7 @@ def read_iamc(path: str | Path) -> list[YearlyValues]:
     return [*table.values()]
 
 
-def _years(network: Network) -> list[int]:
+def _years(network: Network) -> range:
     """Return the calendar year of each interval."""
     episode = network.episode
     begins = None if episode.start is None else year(episode.start)
@@ -110,20 +131,23 @@ def _years(network: Network) -> list[int]:
     if abs(episode.control_interval / elapsed_time(begins + 1, begins, network.time_unit) - 1) > 1e-9:
         interval = f"{episode.control_interval:g} {network.time_unit}"
         raise CirlError(f"network '{network.name}': IAMC has a value a year; its control interval is {interval}")
-    return [int(begins) + t for t in range(episode.horizon)]
+    return range(int(begins), int(begins) + episode.horizon)
 
 
-def _series(simulation: Simulation) -> Iterator[tuple[list[str], Floats]]:
-    """Give the first columns of each row, and its values, shape (steps,)."""
-    network, run, ledger = simulation.network, simulation.rollout, simulation.env.ledger
+def _series(network: Network, control: str) -> Iterator[YearlyRow]:
+    """Give the rows of an episode."""
+    ledger = Ledger(network.with_options(episode={"horizon": 1}))  # entries are the same in every interval
     model, mass = f"cirl_marl {versions()['cirl-marl']}", network.mass_unit
-    scenario = f"{network.name} {network.scenario_name} {simulation.control}"
+    scenario = f"{network.name} {network.scenario_name} {control}"
     own = network.region or WORLD
     scale = elapsed_time(2001, 2000, network.time_unit)
     regions = {node: region for region, nodes in network.copies.items() for node in nodes}
 
-    def row(region: str, variable: str, unit: str) -> list[str]:
-        return [model, scenario, region, variable, unit]
+    def row(region: str, variable: str, unit: str, values: Callable[[Rollout], Floats]) -> YearlyRow:
+        return [model, scenario, region, variable, unit], values
+
+    def at(place: int, values: Callable[[Rollout, int], Floats]) -> Callable[[Rollout], Floats]:
+        return lambda run: values(run, place)
 
     def place(id_: str) -> tuple[str, str]:
         """Return the region of a compartment, and its name there."""
@@ -132,22 +156,25 @@ def _series(simulation: Simulation) -> Iterator[tuple[list[str], Floats]]:
         copied = next((regions[end] for end in ends if end in regions), own)
         return (own, id_) if name is None else (copied, name)
 
-    yield row(own, "Circularity", mass), run.circularity_mean[0]
+    yield row(own, "Circularity", mass, lambda run: run.circularity_mean[0])
     for s, service in enumerate(network.services):
-        yield row(own, f"Service Level|{service.id}", "1"), run.levels[0, s]
+        yield row(own, f"Service Level|{service.id}", "1", at(s, lambda run, s: run.levels[0, s]))
     for i, node in enumerate(network.stores):
         region, name = place(node.id)
-        yield row(region, f"Stock|{name}", mass), run.stock[:, i]
+        yield row(region, f"Stock|{name}", mass, at(i, lambda run, i: run.stock[:, i]))
     for k, arc in enumerate(network.arcs):
         region, name = place(arc.id)
-        yield row(region, f"Flow|{name}", f"{mass}/yr"), run.flow[:, k] * scale
+        yield row(region, f"Flow|{name}", f"{mass}/yr", at(k, lambda run, k: run.flow[:, k] * scale))
     for a, account in enumerate(network.accounts):
         title, unit = account.title or account.id, f"{account.unit}/yr"
-        yield row(own, title, unit), run.bookings[0, a]
-        parts: dict[tuple[str, str], Floats] = {}
-        for entry in range(len(ledger.compartments)):
-            if ledger.account[entry] == a:
-                at, amounts = place(ledger.compartments[entry]), run.entries[:, entry]
-                parts[at] = parts[at] + amounts if at in parts else amounts
-        for (region, name), amounts in parts.items():
-            yield row(region, f"{title}|{name}", unit), amounts
+        yield row(own, title, unit, at(a, lambda run, a: run.bookings[0, a]))
+        parts: dict[tuple[str, str], list[int]] = {}
+        for entry in np.flatnonzero(ledger.account == a).tolist():
+            parts.setdefault(place(ledger.compartments[entry]), []).append(entry)
+        for (region, name), entries in parts.items():
+            yield row(region, f"{title}|{name}", unit, partial(_amounts, entries))
+
+
+def _amounts(entries: list[int], run: Rollout) -> Floats:
+    """Return what some entries come to in each interval, shape (steps,)."""
+    return np.asarray(run.entries[:, entries].sum(axis=1))
