@@ -14,6 +14,8 @@ import pytest
 from conftest import random_network
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from small_networks import ACCOUNTS, booked, plain_networks, small
 from test_capacities import power
 from test_optimum import bounded, certifiable, pinned
@@ -48,6 +50,7 @@ from cirl_marl import (
 from cirl_marl.cli import app
 from cirl_marl.controllers import Neutral, Random
 from cirl_marl.controllers.rollout import Rollout, rollout
+from cirl_marl.drawing.style import draw_steps, number
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.dynamics.ledger import Ledger
 from cirl_marl.evaluation.compared_quantities import rank_quantities
@@ -64,6 +67,7 @@ from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.solver import Basis
 from cirl_marl.optimum.window_planner import WindowPlanner
 from cirl_marl.optimum.windows import WindowPlan, WindowTask
+from cirl_marl.report.account_tables import account_steps, accounts_table, save_accounts
 from cirl_marl.report.data_package import read_package, write_package
 from cirl_marl.report.iamc import read_iamc, write_iamc
 from cirl_marl.report.lever_chart import levers_table, write_levers
@@ -647,6 +651,60 @@ def test_the_command_line_writes_and_plans(tmp_path: Path) -> None:
     assert "cost ≥" in result.output and "emissions at most 100000 t CO2e" in " ".join(result.output.split())
     result = CliRunner().invoke(app, ["plan", str(file), *asked, "emissions", *out])
     assert "needs ACCOUNT=TOTAL" in str(result.exception)
+
+
+@given(seed=st.integers(0, 10_000), shown=st.integers(1, 9))
+def test_steps_of_who_books_lead_to_the_total(seed: int, shown: int) -> None:
+    """Costs and revenues, the largest first, those that are not shown apart as one; nothing is in two of them."""
+    network = booked(random_network(seed, 6, 12), seed)
+    arcs = [replace(arc, accounts={"cost": -3.0, **dict(arc.accounts)}) for arc in network.arcs]
+    simulation = simulate(replace(network, arcs=tuple(arcs)), "random")
+    for place, account in enumerate(network.accounts):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("cirl_marl.report.account_tables.SHOWN", shown)
+            steps = account_steps(simulation, place)
+        sizes = [abs(amount) for _, _, amount in steps[:shown]]
+        total, amounts = float(simulation.rollout.accounts[0, place]), [amount for _, _, amount in steps]
+        assert sum(amounts) == pytest.approx(total, rel=1e-9, abs=1e-9 * max(sizes, default=0.0))
+        assert sizes == sorted(sizes, reverse=True) and len(steps) <= shown + 1
+        rows = [row for row in accounts_table(simulation)[1] if row[0] == account.id]
+        assert [row[2] for row in rows[:shown]] == [label for label, _, _ in steps[:shown]]
+        assert len(steps) <= shown or steps[-1][0] == f"{len(rows) - shown} others"
+        entries = [entry for _, part, _ in steps for entry in part]
+        assert len(entries) == len(set(entries)) and {*simulation.env.ledger.account[entries]} <= {place}
+
+
+def test_each_step_of_a_waterfall_begins_where_the_last_one_ends() -> None:
+    """From the start on, to either side; its note stands to the right of it."""
+    axes = Figure().subplots()
+    draw_steps(axes, np.array([3.0, -5.0, 1.0]), ["red", "green", "blue"], ["a", "b", "c"], start=2.0)
+    boxes = [bar.get_bbox() for bar in axes.patches if isinstance(bar, Rectangle)]
+    ends = [(box.x0, box.x1, (box.y0 + box.y1) / 2) for box in boxes]
+    np.testing.assert_allclose(ends, [(2, 5, 1), (5, 0, 2), (0, 1, 3)], atol=1e-12)
+    lines = [np.asarray(line.get_xydata()).tolist() for line in axes.lines]
+    assert lines == [[[x, i], [x, i + 1]] for i, x in enumerate([2.0, 5.0, 0.0, 1.0])]
+    np.testing.assert_allclose([note.get_position() for note in axes.texts], [(5.075, 1), (5.075, 2), (1.075, 3)])
+    assert [note.get_text() for note in axes.texts] == ["a", "b", "c"]
+
+
+def test_pictures_show_who_books_what_and_the_total(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the colours of the stacks beside it; an account on which nobody books has a total of 0."""
+    figures = list[Figure]()
+    monkeypatch.setattr("cirl_marl.report.account_tables.save", lambda figure, path: figures.append(figure))
+    accounts = (*ACCOUNTS, Account(id="idle", unit="t"))
+    simulation = simulate(replace(city(), accounts=accounts), "scripted", steps=3)
+    save_accounts(tmp_path / "accounts.png", simulation, title="city")
+    (cost, waterfall, _, _, _, idle) = figures[0].axes
+    steps = account_steps(simulation, 0)
+    labels = [tick.get_text() for tick in waterfall.get_yticklabels()]
+    assert labels == [*(label for label, _, _ in steps), f"total {number(simulation.rollout.accounts[0, 0])}"]
+    assert [tick.get_text() for tick in idle.get_yticklabels()] == ["total 0"]
+    bars = [bar for bar in waterfall.patches if isinstance(bar, Rectangle)]
+    assert [bar.get_width() for bar in bars] == pytest.approx(
+        [*(amount for _, _, amount in steps), simulation.rollout.accounts[0, 0]]
+    )
+    assert [bar.get_facecolor() for bar in bars[:-1]] == [bar.get_facecolor() for bar in cost.patches[::3]]
+    assert "discounted" in waterfall.get_title("left") and "discounted" not in idle.get_title("left")
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -89,6 +90,16 @@ def style_axes(axes: Axes, *, title: str = "", ylabel: str = "", size: float = 9
     for side, spine in axes.spines.items():
         spine.set_visible(side in ("left", "bottom"))
         spine.set_color(NEUTRAL)
+
+
+def draw_steps(axes: Axes, steps: Floats, colours: Sequence[str], notes: Sequence[str], *, start: float = 0.0) -> None:
+    """Draw a waterfall: a bar for each step, one below the other from 1 on, each from where the one above it ends."""
+    ends, span = start + np.cumsum(steps), np.ptp(np.append(start + np.cumsum(steps), start)) or 1.0
+    axes.plot([start, start], [0, 1], color=NEUTRAL, linewidth=0.8)
+    for place, (end, step, colour, note) in enumerate(zip(ends, steps, colours, notes, strict=True), 1):
+        axes.barh(place, step, left=end - step, height=0.62, color=colour)
+        axes.plot([end, end], [place, place + 1], color=NEUTRAL, linewidth=0.8)
+        axes.text(max(end, end - step) + 0.015 * span, place, note, va="center", fontsize=8, color=INK)
 
 
 def axis_time(time: Floats, network: Network) -> Floats:

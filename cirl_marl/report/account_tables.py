@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from cirl_marl.controllers.rollout import interval_ends
-from cirl_marl.drawing.style import NEUTRAL, SERIES, WIDTH, readable, save, style_axes
+from cirl_marl.drawing.style import INK, NEUTRAL, SERIES, WIDTH, draw_steps, number, readable, save, style_axes
 from cirl_marl.evaluation.account_front import AccountFront
 from cirl_marl.evaluation.figures import provenance
 from cirl_marl.evaluation.simulations import Simulation
@@ -33,60 +33,77 @@ def write_accounts(folder: Path, name: str, simulation: Simulation, title: str) 
 
 def accounts_table(simulation: Simulation) -> tuple[list[str], list[list[object]]]:
     """Return header and rows: what each compartment books on each account in the episode, the largest amounts first."""
-    network, ledger = simulation.network, simulation.env.ledger
-    amounts = simulation.rollout.entries
-    discounted = amounts * ledger.discount[ledger.account].T
+    network, amounts = simulation.network, simulation.rollout.entries
     regions = {node: region for region, nodes in network.copies.items() for node in nodes}
     rows: list[list[object]] = []
     for place, account in enumerate(network.accounts):
-        for compartment, entries in _by_compartment(simulation, place):
+        for compartment, entries, total in _by_compartment(simulation, place):
             part = network.compartments[compartment]
             ends = [getattr(part, end, "") for end in ("id", "donor", "recipient")]
             region = next((regions[end] for end in ends if end in regions), "")
-            sums = [float(each[:, entries].sum()) for each in (amounts, discounted)]
-            rows.append([account.id, compartment, part.label, region, *sums, account.unit])
+            amount = float(amounts[:, entries].sum())
+            rows.append([account.id, compartment, part.label, region, amount, total, account.unit])
     header = ["account", "compartment", "title", "region", "amount", "discounted", "unit"]
     return header, rows
 
 
 def save_accounts(path: Path, simulation: Simulation, *, title: str) -> Path:
-    """Save what is booked in each interval as a PNG, a panel for each account, stacked by compartment."""
+    """Save what is booked on each account as a PNG: in each interval, stacked by compartment, and who adds what."""
     network, amounts = simulation.network, simulation.rollout.entries
-    figure = Figure(figsize=(WIDTH, 0.6 + 3.2 * len(network.accounts)), layout="constrained")
-    panels = figure.subplots(len(network.accounts), 1, squeeze=False)[:, 0]
+    figure = Figure(figsize=(WIDTH, 0.6 + 3.6 * len(network.accounts)), layout="constrained")
+    panels = figure.subplots(len(network.accounts), 2, squeeze=False, width_ratios=(1.3, 1))
     ends, interval = interval_ends(network), network.episode.control_interval
     dated = network.episode.start is not None and in_years(network.time_unit)
     times = years(network, ends - interval) if dated else ends - interval
     width = interval if not dated else float(np.diff(years(network, [0.0, interval]))[0])
-    for place, (account, panel) in enumerate(zip(network.accounts, panels, strict=True)):
-        parts = [(network.compartments[id_].label, entries) for id_, entries in _by_compartment(simulation, place)]
-        shown = [(label, amounts[:, entries].sum(axis=1)) for label, entries in parts[:SHOWN]]
-        if rest := [entry for _, entries in parts[SHOWN:] for entry in entries]:
-            shown.append((f"{len(parts) - SHOWN} others", amounts[:, rest].sum(axis=1)))
+    for place, (account, (panel, beside)) in enumerate(zip(network.accounts, panels, strict=True)):
+        parts = account_steps(simulation, place)
+        colours = [*SERIES, NEUTRAL][: len(parts)]
         tops: Floats = np.zeros((2, len(times)))  # of what is stacked below and above zero
-        for number, (label, values) in enumerate(shown):
+        for (_, entries, _), colour in zip(parts, colours, strict=True):
+            values = amounts[:, entries].sum(axis=1)
             sides = (values > 0).astype(int)
             bottom = tops[sides, np.arange(len(times))]
-            colour = SERIES[number] if number < SHOWN else NEUTRAL
-            panel.bar(times, values, width, bottom, align="edge", color=colour, label=label)
+            panel.bar(times, values, width, bottom, align="edge", color=colour)
             tops[sides, np.arange(len(times))] += values
         per = f"{interval:g} {network.time_unit}" if interval != 1 else network.time_unit
         style_axes(panel, title=account.title or account.id, ylabel=f"{account.unit} per {per}")
-        if shown:
-            panel.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    panels[-1].set_xlabel("year" if dated else f"time / {network.time_unit}")
+        steps, total = np.array([step for _, _, step in parts]), float(simulation.rollout.accounts[0, place])
+        draw_steps(beside, steps, colours, [number(step) for step in steps])
+        beside.barh(len(parts) + 1, total, height=0.62, color=INK)
+        beside.set_yticks(range(1, len(parts) + 2), [*(label for label, _, _ in parts), f"total {number(total)}"])
+        beside.invert_yaxis()
+        style_axes(beside, title=f"in all, {account.unit}" + (", discounted" if account.discount else ""))
+        beside.margins(x=0.15)
+        beside.grid(False, axis="y")
+        beside.locator_params(axis="x", nbins=4)
+    panels[-1, 0].set_xlabel("year" if dated else f"time / {network.time_unit}")
     figure.suptitle(title)
     return save(figure, path)
 
 
-def _by_compartment(simulation: Simulation, account: int) -> list[tuple[str, list[int]]]:
-    """Return the entries of an account by compartment, those that book most first; those that book nothing are left."""
+def account_steps(simulation: Simulation, account: int) -> list[tuple[str, list[int], float]]:
+    """Return the steps to the total of an account: label, entries and amount of each compartment that adds most to it.
+
+    The rest is the last of them. Amounts are discounted, as totals are.
+    """
+    by_size, parts = _by_compartment(simulation, account), simulation.network.compartments
+    steps = [(parts[id_].label, entries, amount) for id_, entries, amount in by_size[:SHOWN]]
+    if rest := by_size[SHOWN:]:
+        entries, amounts = [entry for _, part, _ in rest for entry in part], [amount for _, _, amount in rest]
+        steps.append((f"{len(rest)} others", entries, sum(amounts)))
+    return steps
+
+
+def _by_compartment(simulation: Simulation, account: int) -> list[tuple[str, list[int], float]]:
+    """Return entries and discounted amount on an account of each compartment that books on it, the largest first."""
     ledger, amounts = simulation.env.ledger, simulation.rollout.entries
     entries: dict[str, list[int]] = {}
-    for entry in np.flatnonzero(ledger.account == account).tolist():
+    for entry in np.flatnonzero((ledger.account == account) & amounts.any(axis=0)).tolist():
         entries.setdefault(ledger.compartments[entry], []).append(entry)
-    sizes = {id_: abs(float(amounts[:, rows].sum())) for id_, rows in entries.items()}
-    return [(id_, entries[id_]) for id_ in sorted(sizes, key=lambda id_: -sizes[id_]) if amounts[:, entries[id_]].any()]
+    discount = ledger.discount[account]
+    parts = [(id_, rows, float(discount @ amounts[:, rows].sum(axis=1))) for id_, rows in entries.items()]
+    return sorted(parts, key=lambda part: -abs(part[2]))
 
 
 def front_table(front: AccountFront) -> Table:

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from cirl_marl.drawing.style import FAINT, INK, NEUTRAL, SERIES, WARNING, WIDTH, number, save, style_axes
+from cirl_marl.drawing.style import FAINT, INK, NEUTRAL, SERIES, WARNING, WIDTH, draw_steps, number, save, style_axes
 from cirl_marl.evaluation.figures import provenance
 from cirl_marl.evaluation.levers import Levers, Trial
 from cirl_marl.records.files import publish_folder, write_json, write_table
@@ -87,14 +87,12 @@ def save_levers(path: str | Path, levers: Levers, *, title: str = "") -> Path:
     figure.suptitle(title or f"{network.title or network.name}: what each lever brings", fontsize=12, fontweight="bold")
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(2.1, 1))
     span = max(abs(levers.plan.objective - usual), abs(whole - usual)) or 1.0
-    for place, end, change in zip(places, ends, added, strict=True):
-        left.barh(place, change, left=end - change, height=0.62, color=SERIES[0] if change >= 0 else WARNING)
-        left.plot([end, end], [place, place + 1], color=NEUTRAL, linewidth=0.8)
-        text = f"+{number(change)}" if change > 0 else number(change)
+    notes = []
+    for end, change in zip(ends, added, strict=True):
         part = f"  {(end - usual) / (whole - usual):.0%}" if whole != usual else ""
-        outward = max(end, end - change) + 0.015 * span
-        left.text(outward, place, f"{text}{part}", va="center", fontsize=8, color=INK)
-    left.plot([usual, usual], [0, 1], color=NEUTRAL, linewidth=0.8)
+        notes.append(f"{'+' if change > 0 else ''}{number(change)}{part}")
+    colours = [SERIES[0] if change >= 0 else WARNING for change in added]
+    draw_steps(left, added, colours, notes, start=usual)
     for tick, value in ((0, usual), (count + 1, whole)):
         left.plot(value, tick, "D", color=INK, markersize=6)
         left.text(value + 0.03 * span, tick, number(value), va="center", fontsize=8, color=INK)
