@@ -61,7 +61,7 @@ from cirl_marl.network.disturbances import AutoRegression, DisturbanceEffect, Ma
 from cirl_marl.network.uncertainty import Spread, network_of_intervals
 from cirl_marl.network.units import factor
 from cirl_marl.optimum import bound, improve, improve_plan, simulate_plan, smooth, smooth_plan
-from cirl_marl.optimum.aims import Aims
+from cirl_marl.optimum.aims import Aims, Budget
 from cirl_marl.optimum.linearised import jacobians, step_program
 from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.solver import Basis
@@ -809,7 +809,9 @@ def test_what_exceeds_a_budget_is_charged_and_asked_for_again(monkeypatch: pytes
     network = city()
     solved = bound(network, min_service=0.9, at_most={"emissions": 3000.0})
     run = simulate_plan(solved)
-    tight = replace(solved, aims=replace(solved.aims, budgets={1: float(run.accounts[0, 1]) - 100.0}))
+    tight = replace(
+        solved, aims=replace(solved.aims, budgets=(Budget(1, float(run.accounts[0, 1]) - 100.0, "emissions"),))
+    )
     rates = np.array([0.0, 2.0])
     values = [improve.penalised_objective(plan, run, rates) for plan in (solved, tight)]
     assert values[1] == pytest.approx(float(run.episode_circularity[0]) - 200.0)

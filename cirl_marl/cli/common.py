@@ -95,7 +95,7 @@ MinService = Annotated[
 ]
 AtMost = Annotated[
     list[str] | None,
-    typer.Option("--at-most", help="ACCOUNT=TOTAL, a budget of an account that plans keep; repeatable."),
+    typer.Option("--at-most", help="ACCOUNT=TOTAL or ACCOUNT/year=MOST, a budget that plans keep; repeatable."),
 ]
 
 Html = Annotated[

@@ -55,7 +55,7 @@ def plan(
             network is large. Of other controllers, and where nothing is proved, plans stay as they are.
         aim: of ``mpc`` and ``optimum``: ``circularity``, the account to keep as low as can be beside ``min_service``,
             or weights of these; see ``bound``.
-        at_most: of these: budgets, the highest total of accounts by id, in their units.
+        at_most: of these: budgets, the highest total of accounts by id, in their units; see ``bound``.
         progress: called with the share of the work that is done.
 
     Returns:
@@ -93,8 +93,11 @@ def _proof(controller: Controller, table: Schedule) -> str:
     elif solution.min_service is not None:
         demand = f"a service of at least {levels_text(network, solution.min_service)}"
     unit = "λ̄/scale" if solution.service_weight is not None else aims.unit(network)
-    prices = (f"one more is worth {price:.4g} {unit}".rstrip() for price in solution.budget_prices.values())
-    demand += "".join(f", {text} ({price})" for text, price in zip(budget_texts(network, aims), prices, strict=True))
+    prices = solution.budget_prices
+    for text, names in budget_texts(network, aims):
+        dearest = max(names, key=prices.__getitem__)
+        worth = f"{prices[dearest]:.4g} {unit}".rstrip() + (f" of {dearest}, no more in others" if names[1:] else "")
+        demand += f", {text} (one more is worth {worth})"
     share = float(gap(limit, aims.value(run)))
     return f"bound with {demand}: {aims.statement(network, limit, 5)}, gap {share:.2%}"
 

@@ -112,7 +112,8 @@ class Training:
         elif checkpoint.name.endswith("-start"):
             for learner, _ in starts:
                 begin_again(checkpoint, learner)
-        aims_of(env.network, CIRCULARITY, config.recipe.run.at_most)  # refuses budgets of what is no account
+        budgets = aims_of(env.network, CIRCULARITY, config.recipe.run.at_most)
+        budgets.refuse_years("run.at_most", "prices move with totals of episodes; bound one, or charge for it")
         self._multiplier = self._constraint_multipliers()  # its least price is the recipe's, not one that has moved
         if self._saved_state is not None:
             self.world.load_state_dict(self._saved_state["world"])

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import field, replace
+from itertools import groupby
 from typing import Annotated
 
 import numpy as np
@@ -14,22 +15,42 @@ from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.dynamics.ledger import Ledger
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network import Floats, Network
+from cirl_marl.network.calendar import years
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import CIRCULARITY
+from cirl_marl.network.units import factor
 from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.vintages import Lifetimes
 
 Aim = str | Mapping[str, float]
 """``circularity``, an account that is kept low, or the weights of λ̄ and of minus the totals of accounts, by name."""
+PER_YEAR = "/year"
+"""What follows the id of an account of which there is a budget per year."""
+RateTables = tuple[Floats, Floats]
+"""What totals have of mean flows and of mean stocks of some intervals; see ``Ledger.rates``."""
+
+
+@positional_record
+class Budget:
+    """The most that may be booked on an account, in an episode or in a year of it."""
+
+    account: Annotated[int, "position of the account"]
+    most: Annotated[float, "what it bounds: the total of the episode, or the amount of the year, not discounted"]
+    name: Annotated[str, "id of the account, with the year"]
+    year: Annotated[slice | None, "intervals of the year; None: it is of the episode"] = None
+
+    def text(self, network: Network) -> str:
+        """Say it."""
+        return f"{self.name} at most {self.most:.6g} {network.accounts[self.account].unit}"
 
 
 @positional_record
 class Aims:
-    """The objective, w·λ̄ − Σ c_i·(total of account i), and the accounts whose totals are bounded."""
+    """The objective, w·λ̄ − Σ c_i·(total of account i), and the budgets."""
 
     circularity: Annotated[float, "w, not negative"] = 1.0
     charges: Annotated[Mapping[int, float], "c by the position of the account"] = field(default_factory=dict)
-    budgets: Annotated[Mapping[int, float], "highest total of accounts, by position"] = field(default_factory=dict)
+    budgets: Annotated[tuple[Budget, ...], "what may be booked at most"] = ()
 
     @property
     def is_circular(self) -> bool:
@@ -58,13 +79,44 @@ class Aims:
         return self.circularity * network.objective.circularity_scale + float(account_sizes)
 
     def totals(self, run: Rollout) -> Floats:
-        """Return the totals of the accounts with budgets, shape (budgets,)."""
-        return run.accounts[0, [*self.budgets]]
+        """Return what is booked of each budget, shape (budgets,)."""
+        totals = [
+            run.accounts[0, budget.account]
+            if budget.year is None
+            else run.bookings[0, budget.account, budget.year].sum()
+            for budget in self.budgets
+        ]
+        return np.array(totals, dtype=np.float64)
+
+    def rates(self, network: Network) -> RateTables:
+        """Return what is booked of each budget by mean flows and by mean stocks of each interval.
+
+        Shapes are (budgets, horizon, arcs) and (budgets, horizon, stores).
+        """
+        ledger, accounts = Ledger(network), [budget.account for budget in self.budgets]
+        counts = np.zeros((len(accounts), ledger.discount.shape[1], 1))
+        for count, budget in zip(counts[..., 0], self.budgets, strict=True):
+            if budget.year is None:
+                count[:] = ledger.discount[budget.account]
+            else:
+                count[budget.year] = 1.0
+        by_flow, by_stock = (rates[accounts] * counts for rates in ledger.rates(with_discount=False))
+        return by_flow, by_stock
+
+    def refuse_years(self, subject: str, reason: str) -> None:
+        """Refuse budgets per year.
+
+        Raises:
+            CirlError: naming the ``subject`` that keeps none of them, an account that has one, and the ``reason``.
+        """
+        for budget in self.budgets:
+            if budget.year is not None:
+                raise CirlError(f"{subject}: no budget per year, as of {budget.name}, can be kept: {reason}")
 
     @property
     def limits(self) -> Floats:
         """The budgets, shape (budgets,)."""
-        return np.array([*self.budgets.values()], dtype=np.float64)
+        return np.array([budget.most for budget in self.budgets], dtype=np.float64)
 
     @property
     def sizes(self) -> Floats:
@@ -73,7 +125,8 @@ class Aims:
 
     def with_lower_budgets(self, excess: Floats) -> Aims:
         """Return the aims with budgets that are lower by ``excess``, shape (budgets,)."""
-        return replace(self, budgets=dict(zip(self.budgets, (self.limits - excess).tolist(), strict=True)))
+        pairs = zip(self.budgets, excess.tolist(), strict=True)
+        return replace(self, budgets=tuple(replace(budget, most=budget.most - more) for budget, more in pairs))
 
     def excess(self, run: Rollout) -> Floats:
         """Return by how much budgets are exceeded, shape (budgets,)."""
@@ -101,10 +154,16 @@ NO_AIMS = Aims()
 """λ̄ is kept high, and there are no budgets."""
 
 
-def budget_texts(network: Network, aims: Aims) -> list[str]:
-    """Say each budget."""
-    accounts = network.accounts
-    return [f"{accounts[i].id} at most {most:.6g} {accounts[i].unit}" for i, most in aims.budgets.items()]
+def budget_texts(network: Network, aims: Aims) -> list[tuple[str, list[str]]]:
+    """Say the budgets, those of an account per year at once, each with the names of the budgets that it is about."""
+    texts = []
+    for _, group in groupby(aims.budgets, lambda budget: (budget.account, budget.year is None)):
+        budgets = [*group]
+        text = budgets[0].text(network)
+        if budgets[0].year is not None:
+            text = f"{replace(budgets[0], name=network.accounts[budgets[0].account].id).text(network)} a year"
+        texts.append((text, [budget.name for budget in budgets]))
+    return texts
 
 
 def aims_of(network: Network, aim: Aim, at_most: Mapping[str, float] | None) -> Aims:
@@ -128,16 +187,41 @@ def aims_of(network: Network, aim: Aim, at_most: Mapping[str, float] | None) -> 
         raise CirlError(f"aim: the weight of '{CIRCULARITY}' must not be negative, got {weights[CIRCULARITY]:g}")
     if not any(weights.values()):
         raise CirlError(f"aim: give '{CIRCULARITY}', an account, or weights of these that are not all 0, got {aim!r}")
-    budgets = {}
-    for account, most in (at_most or {}).items():
+    budgets: list[Budget] = []
+    for name, most in (at_most or {}).items():
+        account, _, period = str(name).partition("/")
         if account not in accounts:
             raise CirlError(f"network '{network.name}': at_most: {unknown_name('account', account, accounts)}")
-        _check_number(f"at_most: the budget of '{account}'", most)
-        if account in weights and not any(weight for name, weight in weights.items() if name != account):
+        if name not in (account, account + PER_YEAR):
+            raise CirlError(f"at_most: '{name}': a budget is of an episode, '{account}', or '{account}{PER_YEAR}'")
+        _check_number(f"at_most: the budget of '{name}'", most)
+        if name in weights and not any(weight for other, weight in weights.items() if other != name):
             raise CirlError(f"at_most: '{account}' is kept as low as can be already; leave out its budget, or the aim")
-        budgets[accounts.index(account)] = float(most)
+        budget = Budget(accounts.index(account), float(most), account)
+        budgets += _by_year(network, budget) if period else [budget]
     charges = {accounts.index(name): float(w) for name, w in weights.items() if name != CIRCULARITY and w}
-    return Aims(float(weights.get(CIRCULARITY, 0.0)), charges, budgets)
+    return Aims(float(weights.get(CIRCULARITY, 0.0)), charges, tuple(budgets))
+
+
+def _by_year(network: Network, budget: Budget) -> Iterator[Budget]:
+    """Yield a budget for each calendar year, or each year from the start on; an interval is of the year of its middle.
+
+    Raises:
+        CirlError: if intervals are longer than a year.
+    """
+    episode, length = network.episode, factor(network.time_unit, "year")
+    if episode.control_interval * length > 1 + 1e-9:
+        interval = f"{episode.control_interval:g} {network.time_unit}"
+        raise CirlError(
+            f"network '{network.name}': at_most: '{budget.name}{PER_YEAR}': an interval, {interval}, is longer than a "
+            f"year; give the total of the episode, '{budget.name}'"
+        )
+    middle = (np.arange(episode.horizon) + 0.5) * episode.control_interval
+    of_interval = np.floor(middle * length + 1 if episode.start is None else years(network, middle)).astype(int)
+    for year in range(int(of_interval[0]), int(of_interval[-1]) + 1):
+        begin, end = np.searchsorted(of_interval, [year, year + 1]).tolist()
+        name = f"{budget.name} in {'year ' if episode.start is None else ''}{year}"
+        yield replace(budget, name=name, year=slice(begin, end))
 
 
 def _check_number(subject: str, number: float) -> None:
@@ -145,14 +229,9 @@ def _check_number(subject: str, number: float) -> None:
         raise CirlError(f"{subject} must be a finite number, got {number!r}")
 
 
-RateTables = tuple[Floats, Floats]
-"""What totals have of mean flows and of mean stocks of some intervals; see ``Ledger.rates``."""
-
-
-def rates_over(network: Network, intervals: range) -> RateTables:
-    """Return the rates of the accounts of a network over some intervals."""
-    by_flow, by_stock = Ledger(network).rates()
-    period = slice(intervals.start, intervals.stop)
+def over(rates: RateTables, intervals: range) -> RateTables:
+    """Return rates of an episode over some of its intervals."""
+    (by_flow, by_stock), period = rates, slice(intervals.start, intervals.stop)
     return by_flow[:, period], by_stock[:, period]
 
 

@@ -12,12 +12,13 @@ from numpy.typing import ArrayLike
 from scipy import sparse
 
 from cirl_marl.definitions.catalogue import load_network
+from cirl_marl.dynamics.ledger import Ledger
 from cirl_marl.errors import CirlError, whole_number
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import frozen_record, positional_record
 from cirl_marl.network.elements import CIRCULARITY
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
-from cirl_marl.optimum.aims import NO_AIMS, Aim, Aims, account_rows, aims_of, budget_texts, rates_over
+from cirl_marl.optimum.aims import NO_AIMS, Aim, Aims, account_rows, aims_of, budget_texts
 from cirl_marl.optimum.certificate import Certificate, Verification, verify
 from cirl_marl.optimum.draw_proofs import Sampling
 from cirl_marl.optimum.options import (
@@ -84,7 +85,7 @@ class Bound:
         mass, demand = self.network.mass_unit, ""
         if self.min_service is not None and self.network.services:
             demand = f", service level at least {levels_text(self.network, self.min_service)}"
-        demand += "".join(f", {text}" for text in budget_texts(self.network, self.aims))
+        demand += "".join(f", {text}" for text, _ in budget_texts(self.network, self.aims))
         statement = self.aims.statement(self.network, self.objective, 6) + demand
         if self.service_weight is not None:
             statement = f"λ̄/scale + {self.service_weight:g}·service ≤ {self.objective:.6g}"
@@ -98,15 +99,15 @@ class Bound:
 
     @property
     def budget_prices(self) -> dict[str, float]:
-        """What the objective gains, to first order, from one unit more of each budget, by account.
+        """What the objective gains, to first order, from one unit more of each budget, by account, or account and year.
 
         With a budget of emissions it is the price of carbon: in money where an account of money is kept low, in mass of
         λ̄ where that is the objective. At a kink it is one of the slopes in between.
         """
         last = len(self.certificate.under) - (0 if self.min_service is None else len(self.network.services))
         multipliers = self.certificate.under[last - len(self.aims.budgets) : last]
-        ids = [self.network.accounts[account].id for account in self.aims.budgets]
-        return dict(zip(ids, np.maximum(-multipliers, 0.0).tolist(), strict=True))
+        names = [budget.name for budget in self.aims.budgets]
+        return dict(zip(names, np.maximum(-multipliers, 0.0).tolist(), strict=True))
 
     def verify(self) -> Verification:
         """Compute the bound again from the program's matrices and the multipliers, without the solver."""
@@ -239,7 +240,8 @@ def bound(
         min_service: in [0, 1], for every service, or one for each, shape (services,).
         aim: ``circularity``; the account whose total is kept as low as can be, the bound being on minus that; or the
             weights of λ̄ and of minus the totals of accounts, by name.
-        at_most: budgets: the highest total of accounts, by id, in their units.
+        at_most: budgets: the highest total of accounts, by id, in their units; with ``/year`` after the id the highest
+            amount of each year, not discounted.
         agents: who acts; None is the network's own choice.
         scenario: scenario of the definition; None is the default.
         horizon: decisions per episode; None takes the definition's.
@@ -362,7 +364,7 @@ def _solve_bound(
     circularity = plan @ circularity_weights(layout)
     levels = plan[:, layout.level : layout.imbalance]
     lifetimes = admissible.lifetimes
-    totals, beside = account_rows(lifetimes, layout, start, rates_over(lifetimes.network, range(len(plan))))
+    totals, beside = account_rows(lifetimes, layout, start, Ledger(lifetimes.network).rates())
     stocks = np.concatenate([(lifetimes.start_planned @ start)[None], plan[:, layout.last]])
     return Bound(
         network=lifetimes.network,
@@ -406,8 +408,8 @@ def _unreachable(problem: Program, min_service: Floats | None, aims: Aims) -> st
                 " beside the other budgets",
             )
         least = [
-            f"{text} (at least {most + excess:.6g}{suffix})"
-            for text, most, excess in zip(budget_texts(network, aims), aims.limits.tolist(), excesses, strict=True)
+            f"{budget.text(network)} (at least {budget.most + excess:.6g}{suffix})"
+            for budget, excess in zip(aims.budgets, excesses, strict=True)
             if excess > 0
         ]
         return f"network '{network.name}': no actions keep the budget of {', '.join(least)}"

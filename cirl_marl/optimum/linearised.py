@@ -20,7 +20,7 @@ from cirl_marl.dynamics.supply import Supply
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import positional_record
-from cirl_marl.optimum.aims import Aims
+from cirl_marl.optimum.aims import Aims, RateTables
 from cirl_marl.optimum.bounds import Bound
 from cirl_marl.optimum.program import LinearProgram
 from cirl_marl.optimum.window_simulator import WindowSimulator
@@ -141,10 +141,10 @@ def step_program(
     low = np.array([network.interval_means(service.low) for service in network.services]).reshape(services, steps)
     low *= 1.0 + margin
     measure, by_stage, imbalances = _measures(bound, dynamics)
-    accounts = _account_weights(bound, dynamics)
+    accounts = _account_shares(Ledger(network).rates(), dynamics)
     weights = -bound.aims.objective(-_circularity_cost(bound, dynamics), accounts)
     cost, spent = np.zeros(count), np.zeros((len(limits), count))
-    budgets = accounts[[*bound.aims.budgets]]
+    budgets = _account_shares(bound.aims.rates(network), dynamics)
     state = np.concatenate([stocks, run.flow], axis=1)
     columns = size * np.arange(steps)[:, None] + np.arange(size)
     rows: list[sparse.csr_array] = []
@@ -259,11 +259,11 @@ def _circularity_cost(bound: Bound, dynamics: Dynamics) -> Floats:
     return np.broadcast_to(cost, (steps, len(cost)))
 
 
-def _account_weights(bound: Bound, dynamics: Dynamics) -> Floats:
-    """Return the share of (x', f̄) of each interval in the totals of accounts, (accounts, steps, stocks + arcs)."""
-    by_flow, by_stock = Ledger(bound.network).rates()
+def _account_shares(rates: RateTables, dynamics: Dynamics) -> Floats:
+    """Return the share of (x', f̄) of each interval in what is booked at some rates, (rates, steps, stocks + arcs)."""
+    by_flow, by_stock = rates
     by_stock[:, :-1] += by_stock[:, 1:]  # a stock ends one interval and begins the next
-    stages = np.zeros((len(bound.network.stores), dynamics.rows.nodes.stop))
+    stages = np.zeros((by_stock.shape[2], dynamics.rows.nodes.stop))
     for store in range(len(stages)):
         stages[store, np.atleast_1d(dynamics.rows.stages.get(store, store))] = 1.0
     return np.concatenate([by_stock / 2 @ stages, by_flow], axis=2)

@@ -119,7 +119,7 @@ class MPC(Planner):
                 ``service_weight``.
             service_weight: w ≥ 0; goes with the aim ``circularity``.
             aim: see ``bound``.
-            at_most: budgets, likewise; in a certain network without a ``horizon``.
+            at_most: budgets of episodes, likewise; in a certain network without a ``horizon``.
             degree: degree of the test polynomials; see ``bound``.
             replan: decisions carried out of each plan; None: 4, in a disturbed network 1.
             futures: how many are drawn at every decision in a disturbed network; None: one, in which all is as it is
@@ -164,6 +164,7 @@ class MPC(Planner):
         """
         network, (horizon, replan, futures) = env.network, self._options
         self._aims = aims = aims_of(network, self._aim, self._at_most)
+        aims.refuse_years("MPC", "plans know what is left of a total, not of a year; take optimum control")
         self._levels = None if self._min_service is None else demanded_levels(network, self._min_service)
         self.note, self._env, is_disturbed = "", env, bool(network.disturbed)
         if horizon is not None and aims.budgets and not is_disturbed:
@@ -204,8 +205,8 @@ class MPC(Planner):
             return
         network = self._env.network
         excess = plan.bookings.sum(axis=0) - plan.task.limits
-        ids = [network.accounts[account].id for account in self._aims.budgets]
-        faults = [f"{part:.2%} more {id_}" for id_, part in zip(ids, excess.tolist(), strict=True) if part > NOTABLE]
+        pairs = zip(self._aims.budgets, excess.tolist(), strict=True)
+        faults = [f"{part:.2%} more {budget.name}" for budget, part in pairs if part > NOTABLE]
         if plan.task.demand is not None:
             lacks = zip(network.services, (plan.task.demand - plan.level).tolist(), strict=True)
             faults += [f"{lack:.4f} less of '{service.id}'" for service, lack in lacks if lack > NOTABLE]
@@ -252,7 +253,7 @@ class MPC(Planner):
         if self._levels is not None:
             deficit = self._levels * steps - state.service[:, copy]
         if outlook is None:
-            left = self._aims.limits - state.accounts[[*self._aims.budgets], copy]
+            left = self._aims.limits - state.accounts[[budget.account for budget in self._aims.budgets], copy]
             demands = _Demands(deficit, left / self._aims.sizes)
         else:  # no level is demanded, all that lacks has its price
             deficit = None if deficit is None else np.full(len(deficit), float(len(rest)))

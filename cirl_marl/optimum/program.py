@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import sparse
 
+from cirl_marl.dynamics.ledger import Ledger
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import frozen_record
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.aims import Aims, account_rows, rates_over
+from cirl_marl.optimum.aims import Aims, account_rows, over
 from cirl_marl.optimum.constraints import (
     balances,
     capacity_limits,
@@ -216,13 +217,15 @@ class Programs:
         lifetime_rows, lifetime_limits = lifetimes.rows(layout, initial, intervals)
         blocks, limits = [under, from_start, lifetime_rows], [under_to, rows.limits(), lifetime_limits]
         cost, constant = np.tile(-self._weights / steps, steps), self._constant
-        if aims is not None and (aims.budgets or aims.charges):
-            totals, beside = account_rows(lifetimes, layout, initial, rates_over(lifetimes.network, intervals))
-            cost = -aims.objective(-cost, totals.toarray()) if aims.charges else cost
-            constant = float(aims.objective(constant, beside))
-            rows_of_budgets = [*aims.budgets]
-            blocks.append(totals[rows_of_budgets])
-            limits.append(aims.limits - beside[rows_of_budgets])
+        if aims is not None and not aims.is_circular:
+            rates = over(Ledger(lifetimes.network).rates(), intervals)
+            totals, beside = account_rows(lifetimes, layout, initial, rates)
+            cost, constant = -aims.objective(-cost, totals.toarray()), float(aims.objective(constant, beside))
+        if aims is not None and aims.budgets:
+            rates = over(aims.rates(lifetimes.network), intervals)
+            totals, beside = account_rows(lifetimes, layout, initial, rates)
+            blocks.append(totals)
+            limits.append(aims.limits - beside)
         if min_service is not None:
             services = len(network.services)
             levels = sparse.eye_array(services, layout.size, k=layout.level)

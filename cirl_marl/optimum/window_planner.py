@@ -112,9 +112,9 @@ class Future:
         self.cache: IntervalCache = IntervalCache() if like is None else like.cache
         self._shift = 0
         self.aims: Aims = aims if like is None else like.aims
-        self._budgets = [*self.aims.budgets]
+        self._budgets = [budget.account for budget in self.aims.budgets]
         self._ledger, self._discount = None, EMPTY
-        if self.aims.charges or self._budgets:
+        if not self.aims.is_circular or self._budgets:
             self._ledger = Ledger(network)
             self._discount = self._ledger.discount if like is None else like._discount
             self._rate_tables: RateTables = self._ledger.rates(with_discount=False)

@@ -1,0 +1,227 @@
+"""Budgets of accounts per year: what is proved, planned and told beside them, and where they are refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from small_networks import ACCOUNTS, booked, small
+from test_accounts import city
+from test_optimum import bounded, pinned
+from typer.testing import CliRunner
+
+from cirl_marl import (
+    MPC,
+    Account,
+    Arc,
+    CirlError,
+    Control,
+    ControlKind,
+    Law,
+    MultiAgentVectorEnv,
+    Network,
+    Series,
+    bound,
+    load_network,
+    load_recipe,
+    train,
+    write_network,
+)
+from cirl_marl.cli import app
+from cirl_marl.controllers import Random
+from cirl_marl.controllers.rollout import Rollout, rollout
+from cirl_marl.dynamics.integrator import Dynamics
+from cirl_marl.optimum import improve, improve_plan, simulate_plan, smooth_plan
+from cirl_marl.optimum.aims import aims_of
+from cirl_marl.optimum.linearised import jacobians, step_program
+
+
+def yearly(horizon: int = 6) -> Network:
+    """Return the city with a year in place of a day; nothing is discounted."""
+    network = city().with_options(episode={"horizon": horizon})
+    return replace(network, time_unit="year", accounts=tuple(replace(each, discount=0.0) for each in ACCOUNTS))
+
+
+def by_year(run: Rollout) -> Any:
+    """Return the emissions of each interval, which is a year."""
+    return run.bookings[0, 1]
+
+
+@pytest.mark.parametrize("start", [None, 2030.5])
+def test_a_budget_per_year_is_spent_when_it_earns_most(start: float | None) -> None:
+    """Of flows that emit as much in each half of a year, and earn differently, by a program written by hand.
+
+    In five halves from a January on there are three years, from a July on as many; each has what it may emit.
+    """
+    price = np.array([3.0, 5.0, 2.0, 4.0, 1.0])
+    earns = Series(times=tuple(np.arange(6) / 2), values=(*-price, 0.0), interpolation="step")
+    sale = Arc(
+        id="sale",
+        donor="store",
+        recipient="market",
+        law=Law.CONTROLLED,
+        control=Control(kind=ControlKind.FLOW, low=0.0, neutral=1.0, high=10.0),
+    )
+    network = small({"store": 1000.0, "market": 0.0}, [sale], interval=0.5)
+    accounts = (Account(id="earnings", unit="EUR_2023"), Account(id="emissions", unit="t CO2e", discount=0.1))
+    arcs = (replace(sale, accounts={"earnings": earns, "emissions": 0.5}),)
+    network = replace(network, accounts=accounts, arcs=arcs, time_unit="year").with_options(episode={"start": start})
+    kept = bound(network, aim="earnings", at_most={"emissions/year": 1.0})
+    parts = [[0, 1], [2, 3], [4]] if start is None else [[0], [1, 2], [3, 4]]
+    assert kept.objective == pytest.approx(sum(2.0 * price[part].max() for part in parts))  # 2 t emit 1 t CO2e
+    names = ("year 1", "year 2", "year 3") if start is None else ("2030", "2031", "2032")
+    expected = {f"emissions in {name}": 2.0 * price[part].max() for name, part in zip(names, parts, strict=True)}
+    assert kept.budget_prices == pytest.approx(expected)
+    assert kept.accounts[0] == pytest.approx(-kept.objective)
+    run = simulate_plan(kept)
+    sums = [run.bookings[0, 1, part].sum() for part in parts]
+    np.testing.assert_allclose(sums, 1.0, atol=1e-6)
+    np.testing.assert_allclose(kept.aims.totals(run), sums)
+
+
+def test_the_budget_of_the_only_year_is_that_of_the_episode() -> None:
+    """Of an account that is not discounted: the same bound, price and plan; both together are no more than either."""
+    network = city().with_options(episode={"horizon": 30})
+    free, least = (bound(network, aim=aim, min_service=0.95).accounts[1] for aim in ("circularity", "emissions"))
+    most = float(free + least) / 2
+    in_all, in_year, both = (
+        bound(network, min_service=0.95, at_most=dict.fromkeys(names, most))
+        for names in (["emissions"], ["emissions/year"], ["emissions/year", "emissions"])
+    )
+    assert in_all.objective == in_year.objective == pytest.approx(both.objective, rel=1e-6)
+    assert [*in_all.budget_prices.values()] == [*in_year.budget_prices.values()]
+    assert [*both.budget_prices] == ["emissions in year 1", "emissions"]
+    np.testing.assert_array_equal(in_all.actions, in_year.actions)
+
+
+@pytest.mark.medium
+@given(
+    network=st.from_type(Network),
+    interval=st.floats(0.2, 0.7),
+    seed=st.integers(0, 1000),
+    place=st.sampled_from([0, 1]),
+)
+def test_no_episode_that_keeps_each_year_is_above_the_bound(
+    network: Network, interval: float, seed: int, place: int
+) -> None:
+    """Random actions on random networks with random rates, in up to three years."""
+    network = replace(booked(bounded(network, interval).network, seed), time_unit="year")
+    free = bound(network, network.initial[1])
+    run = rollout(MultiAgentVectorEnv(pinned(free), num_envs=24), Random(), seed=seed)
+    account, middle = ACCOUNTS[place].id, np.arange(network.episode.horizon) + 0.5
+    year = (middle * network.episode.control_interval).astype(int)
+    years = np.stack([run.bookings[:, place, year == number].sum(axis=1) for number in range(year[-1] + 1)])
+    budget = float(np.median(years.max(axis=0)))
+    kept = (years <= budget).all(axis=0)
+    best = bound(network, network.initial[1], at_most={f"{account}/year": budget})
+    scale = max(float(abs(best.problem.cost) @ np.maximum(abs(best.problem.low), abs(best.problem.high))), 1.0)
+    assert kept.any() and (run.episode_circularity[kept] <= best.objective + 1e-9 * scale).all()
+    assert best.verify().bound == best.objective
+    assert float(best.at()) == pytest.approx(best.objective, rel=1e-9, abs=1e-12 * scale)
+    size = float((abs(best.problem.under) @ abs(best.solution)).max(initial=1.0))
+    assert (best.problem.under @ best.solution <= best.problem.under_to + 1e-5 * size).all()
+
+
+@pytest.mark.parametrize("most_slopes", [None, 0])
+def test_plans_keep_the_budget_of_each_year(monkeypatch: pytest.MonkeyPatch, most_slopes: int | None) -> None:
+    """Small ones by Jacobians, large ones by tightening; a budget of the years is worth what solved programs say."""
+    if most_slopes is not None:
+        monkeypatch.setattr(improve, "MOST_SLOPES", most_slopes)
+    network = yearly()
+    free, least = (bound(network, aim=aim, min_service=0.95) for aim in ("circularity", "emissions"))
+    most = 1.05 * float(by_year(simulate_plan(least)).max())
+    assert most < by_year(simulate_plan(free)).max()
+    solved = bound(network, min_service=0.95, at_most={"emissions/year": most})
+    plan = improve_plan(solved)
+    run = simulate_plan(plan if most_slopes == 0 else smooth_plan(plan))
+    assert by_year(run).max() <= most * (1 + 1e-3 * (most_slopes == 0) + 1e-4)
+    assert run.episode_levels.min() >= 0.95 - 1e-3
+    assert solved.gap(solved.aims.value(run)) <= 0.02
+    step = 1e-3 * most
+    around = [bound(network, min_service=0.95, at_most={"emissions/year": most + way * step}) for way in (-1, 1)]
+    quotients = np.diff([around[0].objective, solved.objective, around[1].objective]) / step
+    assert 0.99 * quotients[1] <= sum(solved.budget_prices.values()) <= 1.01 * quotients[0]
+    assert f"emissions at most {most:.6g} t CO2e a year;" in str(solved)
+
+
+def test_a_step_of_a_plan_knows_what_each_year_books() -> None:
+    """To first order, stocks included, as the simulator does."""
+    network = yearly(4)
+    stores = [replace(node, holding={"emissions": 0.05}) if node.stores else node for node in network.nodes]
+    network = replace(network, nodes=tuple(stores))
+    solved = bound(network, min_service=0.5, at_most={"emissions/year": 3000.0, "emissions": 9000.0})
+    rng, dynamics = np.random.default_rng(0), Dynamics(network)
+    middle = replace(solved, actions=rng.uniform(-0.5, 0.5, solved.actions.shape))
+    run = simulate_plan(middle)
+    program = step_program(middle, dynamics, run, np.array([0.5]), np.ones(6), 0.1, jacobians(middle, dynamics))
+    moves = np.zeros(len(program.origin))
+    moves[program.action] = 1e-4 * rng.uniform(-1, 1, program.action.shape)
+    trial = simulate_plan(replace(middle, actions=middle.actions + moves[program.action]))
+    changes = np.append(by_year(trial) - by_year(run), trial.accounts[0, 1] - run.accounts[0, 1])
+    np.testing.assert_allclose(program.problem.under[-5:] @ moves, changes, rtol=1e-3)
+    np.testing.assert_allclose(program.problem.under_to[-5:-1], 3000.0 - by_year(run))
+
+
+def test_budgets_per_year_that_cannot_be_meant_are_refused() -> None:
+    """Other periods, intervals of several years, out of reach, and whoever keeps budgets of episodes alone."""
+    network = yearly()
+    least = float(by_year(simulate_plan(bound(network, aim="emissions", min_service=0.95))).max())
+    slow = replace(network, time_unit="century")
+    for name, of, message in (
+        ("emissions/month", network, "'emissions/month': a budget is of an episode, 'emissions', or 'emissions/year'"),
+        ("emissions/", network, "'emissions/': a budget is of an episode"),
+        ("emission/year", network, "unknown account 'emission'. Did you mean 'emissions'"),
+        ("emissions/year", slow, "'emissions/year': an interval, 1 century, is longer than a year; give the total"),
+    ):
+        with pytest.raises(CirlError, match=message):
+            bound(of, at_most={name: 1.0})
+    with pytest.raises(CirlError, match=r"the budget of 'emissions/year' must be a finite number"):
+        bound(network, at_most={"emissions/year": float("nan")})
+    with pytest.raises(CirlError, match=r"the budget of emissions in year 1 at most .*\(at least .*emissions in year"):
+        bound(network, min_service=0.95, at_most={"emissions/year": 0.5 * least})
+    assert bound(network, aim="emissions", min_service=0.95, at_most={"emissions/year": 1.01 * least}).verify()
+    env = MultiAgentVectorEnv(network, num_envs=1)
+    with pytest.raises(CirlError, match="MPC: no budget per year, as of emissions in year 1, can be kept: plans know"):
+        MPC(min_service=0.9, at_most={"emissions/year": 1e9}).start(env, 0)
+    given = load_recipe("exact_gradients")
+    recipe = given.model_copy(update={"run": given.run.model_copy(update={"at_most": {"emissions/year": 1e9}})})
+    with pytest.raises(CirlError, match=r"run\.at_most: no budget per year, as of emissions in year 1, can be kept"):
+        train(network, recipe, steps=1000)
+
+
+def test_intervals_are_of_the_year_of_their_middle() -> None:
+    """Of weeks some begin in one year and end in the next; each is of one of them."""
+    network = replace(city(), time_unit="week").with_options(episode={"horizon": 106})
+    budgets = aims_of(network, "circularity", {"emissions/year": 5.0}).budgets
+    assert [budget.year for budget in budgets] == [slice(0, 52), slice(52, 104), slice(104, 106)]
+    assert {budget.most for budget in budgets} == {5.0}
+    dated = aims_of(load_network("steel_japan"), "circularity", {"emissions/year": 5.0}).budgets
+    assert [budget.name for budget in dated[:2]] == ["emissions in 2025", "emissions in 2026"]
+    assert [budget.year for budget in dated[:2]] == [slice(0, 1), slice(1, 2)]
+
+
+def test_the_command_line_plans_with_budgets_per_year(tmp_path: Path) -> None:
+    """It says the budget once, with the year in which more of it is worth most."""
+    file, network = tmp_path / "city.toml", yearly(3)
+    write_network(network, file)
+    most = 1.05 * float(by_year(simulate_plan(bound(network, aim="emissions", min_service=0.9))).max())
+    asked = ["--control", "optimum", "--min-service", "0.9", "--at-most", f"emissions/year={most}"]
+    result = CliRunner().invoke(app, ["plan", str(file), *asked, "--out", str(tmp_path / "p.csv")])
+    assert result.exit_code == 0, result.output
+    solved = bound(network, min_service=0.9, at_most={"emissions/year": most})
+    dearest = max(solved.budget_prices, key=solved.budget_prices.__getitem__)
+    worth = f"one more is worth {solved.budget_prices[dearest]:.4g} t of λ̄ of {dearest}, no more in others"
+    assert f"emissions at most {most:.6g} t CO2e a year ({worth})" in " ".join(result.output.split())
+
+
+def test_a_weight_of_circularity_alone_scales_the_bound() -> None:
+    """What is said of 2·λ̄ is twice what is said of λ̄, and a plan has as much of it."""
+    network = city().with_options(episode={"horizon": 5})
+    once, twice = (bound(network, aim={"circularity": weight}) for weight in (1.0, 2.0))
+    assert twice.objective == pytest.approx(2 * once.objective, rel=1e-6)
+    assert str(twice).partition("2·λ̄ ≤ ")[2].startswith(f"{twice.objective:.6g}")
