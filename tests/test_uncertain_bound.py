@@ -42,6 +42,7 @@ from cirl_marl.network.elements import Lifetime
 from cirl_marl.network.innovations import innovations
 from cirl_marl.network.uncertainty import Spread, draw_network, expected_network
 from cirl_marl.optimum import NoCertificate, draws, price_fit, uncertain_bound
+from cirl_marl.optimum.aims import NO_AIMS, Aims
 from cirl_marl.optimum.draw_proofs import Sampling
 from cirl_marl.optimum.draws import Draw, DrawProgram, DrawProof, Prices
 from cirl_marl.optimum.mpc import MPC
@@ -91,7 +92,7 @@ class Paths:
     programs: tuple[DrawProgram, ...]
 
     @classmethod
-    def of(cls, network: Network, degree: int = 1) -> Paths:
+    def of(cls, network: Network, degree: int = 1, aims: Aims = NO_AIMS) -> Paths:
         """Write them all down; one chain disturbs the network."""
         (chain,) = network.processes.disturbances
         assert isinstance(chain, Markov)
@@ -107,7 +108,7 @@ class Paths:
                 draw = Draw(certain, start_stocks, parts.features[..., 0], parts.new[..., 0])
                 chances.append(chance)
                 regimes.append(path)
-                programs.append(DrawProgram(draw, None, degree))
+                programs.append(DrawProgram(draw, None, degree, aims=aims))
         return cls(np.array(chances), np.array(regimes), tuple(programs))
 
     def groups(self, until: int) -> Iterator[NDArray[np.intp]]:
@@ -116,7 +117,7 @@ class Paths:
         for k in range(int(group.max()) + 1):
             yield np.flatnonzero(group.ravel() == k)
 
-    def best(self, demand: float, *, states_only: bool = False) -> tuple[float, list[Floats], float]:
+    def best(self, demand: float, *, states_only: bool = False) -> tuple[float, list[Floats], Floats]:
         """Return the most that anybody reaches on average who does not foresee, the extensive form; and multipliers.
 
         Every path has variables of its own; all of an interval, or with ``states_only`` the stocks at its end, are the
@@ -124,8 +125,11 @@ class Paths:
 
         Returns:
             The optimum, the multipliers of the stocks at the start of intervals 1, 2, … on each path, per probability,
-            and that of the demand.
+            and those of the demand and of budgets, in parts of these.
         """
+        aims, pairs = self.programs[0].aims, [program.bookings for program in self.programs]
+        booked = sparse.hstack([p * row for p, (row, _) in zip(self.chance, pairs, strict=True)], format="csr")
+        left = aims.limits - self.chance @ np.array([beside for _, beside in pairs])
         problems = [program.problem for program in self.programs]
         layout, count = problems[0].layout, len(problems[0].cost)
         steps, width = count // layout.size, count * len(problems)
@@ -145,8 +149,8 @@ class Paths:
                         keys.append((int(i), int(group[0]), t, int(column - columns[0])))
         solution = optimize.linprog(
             cost,
-            A_ub=sparse.vstack([under, sparse.csr_array(level.reshape(1, -1))], format="csr"),
-            b_ub=np.concatenate([*(problem.under_to for problem in problems), [-demand]]),
+            A_ub=sparse.vstack([under, sparse.csr_array(level.reshape(1, -1)), booked], format="csr"),
+            b_ub=np.concatenate([*(problem.under_to for problem in problems), [-demand], left]),
             A_eq=sparse.vstack([equal, *rows], format="csr"),
             b_eq=np.concatenate([*(problem.equal_to for problem in problems), np.zeros(len(rows))]),
             bounds=np.stack([np.concatenate([getattr(p, end) for p in problems]) for end in ("low", "high")], axis=1),
@@ -159,7 +163,7 @@ class Paths:
                 # marginal y of x_i − x_j = 0: the Lagrangian of the costs has −y·(x_i − x_j)
                 weights[i][t, n] -= y / self.chance[i]
                 weights[j][t, n] += y / self.chance[j]
-        return -float(solution.fun), weights, -float(solution.ineqlin.marginals[-1])
+        return -float(solution.fun), weights, -solution.ineqlin.marginals[under.shape[0] :] * np.append(1.0, aims.sizes)
 
     def mean(self, prices: Prices) -> float:
         """Return the mean over all paths of what is proved under prices."""
@@ -167,7 +171,7 @@ class Paths:
         return float(self.chance @ np.array(values))
 
 
-def prices_of(network: Network, seed: int, size: float, demand: float, level_price: float) -> Prices:
+def prices_of(network: Network, seed: int, size: float, demand: float, level_price: Floats | float) -> Prices:
     """Return arbitrary prices."""
     rng = np.random.default_rng(seed)
     stores, functions = len(network.stores), innovations(network.processes, np.zeros((1, 1, 1))).features.shape[1]

@@ -148,7 +148,8 @@ def test_feedback_is_between_the_blind_and_the_best() -> None:
     """
     network = seasonal()
     paths = Paths.of(network, 3)
-    best, _, price = paths.best(DEMAND)
+    best, _, multipliers = paths.best(DEMAND)
+    price = float(multipliers[0])
     weight = price / network.objective.circularity_scale
     drawn = network.processes.sample(range(first_seed(0), first_seed(0) + 100)).states[:3, 0].T
     seeds = [first_seed(0) + int((drawn == path).all(axis=1).argmax()) for path in paths.regimes]

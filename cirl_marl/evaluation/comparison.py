@@ -84,14 +84,19 @@ class Entry:
     @property
     def expected_gap(self) -> Floats | None:
         """(bound for who does not foresee − λ̄ − Σ_s μ_s (level_s − demand_s))/scale, shape (episodes,)."""
-        bound = self.uncertain_bound
-        return None if bound is None else bound.gaps(self.circularity, self.rollout.episode_levels)
+        return self._expected_gap(with_foresight=False)
 
     @property
     def foresight_gap(self) -> Floats | None:
         """The same, held against who knows the future of each episode."""
-        bound, levels = self.uncertain_bound, self.rollout.episode_levels
-        return None if bound is None else bound.gaps(self.circularity, levels, with_foresight=True)
+        return self._expected_gap(with_foresight=True)
+
+    def _expected_gap(self, *, with_foresight: bool) -> Floats | None:
+        bound, run = self.uncertain_bound, self.rollout
+        if bound is None:
+            return None
+        bookings = bound.aims.bookings(run)
+        return bound.gaps(run.episode_circularity, run.episode_levels, bookings, with_foresight=with_foresight)
 
 
 @dataclass(frozen=True, slots=True)

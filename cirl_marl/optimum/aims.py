@@ -79,14 +79,19 @@ class Aims:
         return self.circularity * network.objective.circularity_scale + float(account_sizes)
 
     def totals(self, run: Rollout) -> Floats:
-        """Return what is booked of each budget, shape (budgets,)."""
-        totals = [
-            run.accounts[0, budget.account]
-            if budget.year is None
-            else run.bookings[0, budget.account, budget.year].sum()
-            for budget in self.budgets
-        ]
-        return np.array(totals, dtype=np.float64)
+        """Return what the first episode of a rollout books of each budget, shape (budgets,)."""
+        totals: Floats = self.bookings(run)[0]
+        return totals
+
+    def bookings(self, run: Rollout) -> Floats:
+        """Return what each episode of a rollout books of each budget, shape (episodes, budgets)."""
+        amounts = np.empty((len(run.accounts), len(self.budgets)))
+        for column, budget in zip(amounts.T, self.budgets, strict=True):
+            if budget.year is None:
+                column[:] = run.accounts[:, budget.account]
+            else:
+                column[:] = run.bookings[:, budget.account, budget.year].sum(axis=1)
+        return amounts
 
     def rates(self, network: Network) -> RateTables:
         """Return what is booked of each budget by mean flows and by mean stocks of each interval.

@@ -198,6 +198,7 @@ def bound(
     initial: Mapping[str, float] | ArrayLike | None = None,
     *,
     min_service: ArrayLike | None = None,
+    at_most: Mapping[str, float] | None = None,
     agents: Sequence[str] | None = None,
     scenario: str | None = None,
     horizon: int | None = None,
@@ -230,7 +231,7 @@ def bound(
     bound holds but may be loose.
 
     With ``uncertain`` it is on the mean of λ̄ over all that may happen, of policies that do not know the future, and
-    ``min_service`` on the expected levels.
+    ``min_service`` and ``at_most`` on the expected levels and amounts.
 
     Args:
         network: catalogue name, path of a definition file, or a network.
@@ -248,7 +249,7 @@ def bound(
         degree: degree of the test polynomials, 1 or more; higher is tighter and slower.
         near: a bound of a similar program, from whose solution this one is reached sooner: another start or level.
         uncertain: whether disturbances and uncertain numbers are drawn, and how if not by default; excludes
-            ``service_weight`` and ``near``.
+            ``service_weight``, ``near`` and ``aim``.
 
     Raises:
         NoCertificate: for a network whose flows are not linear laws: inner physics, batches, inexact solvers.
@@ -261,12 +262,12 @@ def bound(
     if not isinstance(uncertain, bool | np.bool_ | Sampling):
         raise CirlError(f"uncertain must be True, False or a Sampling, got {uncertain!r}")
     if isinstance(uncertain, Sampling) or uncertain:
-        if service_weight is not None or near is not None or aim != CIRCULARITY or at_most:
-            options = "service_weight, near, aim and at_most"
+        if service_weight is not None or near is not None or aim != CIRCULARITY:
+            options = "service_weight, near and aim"
             raise CirlError(f"uncertain: {options} go with a certain future; demand min_service")
         levels = None if min_service is None else demanded_levels(definition, min_service)
         sampling = uncertain if isinstance(uncertain, Sampling) else Sampling()
-        return uncertain_bound(definition, agents, initial, levels, degree, sampling)
+        return uncertain_bound(definition, agents, initial, levels, degree, sampling, aims_of(definition, aim, at_most))
     aims = aims_of(definition, aim, at_most)
     if service_weight is not None and not aims.is_circular:
         raise CirlError(f"service_weight goes with the aim '{CIRCULARITY}', not with {aim!r}; demand min_service")

@@ -19,6 +19,7 @@ from cirl_marl.errors import CirlError, whole_number
 from cirl_marl.jobs import JobStatus, Tell, check_place, raise_first, run_jobs
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import frozen_record, positional_record
+from cirl_marl.optimum.aims import Aims
 from cirl_marl.optimum.certificate import Certificate
 from cirl_marl.optimum.draws import Draw, DrawProgram, Prices, draws_of
 from cirl_marl.optimum.program import circularity_weights
@@ -122,13 +123,14 @@ def prove_draws(
     degree: int,
     sampling: Sampling,
     prices: Sequence[Prices],
+    aims: Aims,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Proofs:
     """Prove a bound of every draw under some prices, none of them left out."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary if sampling.directory is None else sampling.directory)
         first = first_seed(sampling.seed)
-        digest = _digest(network, agents, initial, degree, sampling.numbers, prices)
+        digest = _digest(network, agents, initial, degree, sampling.numbers, prices, aims)
         jobs = [
             ProofJob(
                 name=f"draws-{digest}-{first + begin}-{min(CHUNK, sampling.draws - begin)}",
@@ -140,6 +142,7 @@ def prove_draws(
                 first=first + begin,
                 count=min(CHUNK, sampling.draws - begin),
                 prices=tuple(prices),
+                aims=aims,
                 folder=folder,
             )
             for begin in range(0, sampling.draws, CHUNK)
@@ -169,9 +172,11 @@ def _digest(
     degree: int,
     numbers: bool,
     prices: Sequence[Prices],
+    aims: Aims,
 ) -> str:
     """Return what tells proofs of one question from those of another."""
-    hashed = hashlib.sha256(repr((fingerprint(network), tuple(agents), degree, numbers)).encode())
+    question = (fingerprint(network), tuple(agents), degree, numbers, *aims.budgets)
+    hashed = hashlib.sha256(repr(question).encode())
     arrays = [getattr(price, part.name) for price in prices for part in fields(price)]
     for array in [np.zeros(0) if initial is None else initial, *arrays]:
         hashed.update(repr(np.shape(array)).encode() + np.ascontiguousarray(array, dtype=float).tobytes())
@@ -191,6 +196,7 @@ class ProofJob:
     first: int
     count: int
     prices: tuple[Prices, ...]
+    aims: Aims
     folder: Path
 
     @property
@@ -211,7 +217,7 @@ class ProofJob:
         certificates: list[Certificate] = []
         basis = None
         for i, future in enumerate(draws):
-            program = DrawProgram(future, self.agents or None, self.degree)
+            program = DrawProgram(future, self.agents or None, self.degree, aims=self.aims)
             for k, prices in enumerate(self.prices):
                 proof = program.prove(program.with_prices(prices), basis, certificates)
                 basis, values[i, k] = proof.basis or basis, proof.value

@@ -13,6 +13,7 @@ from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.innovations import innovations
 from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.aims import NO_AIMS, Aims, account_rows
 from cirl_marl.optimum.certificate import Certificate, verify
 from cirl_marl.optimum.program import Program, Programs
 from cirl_marl.optimum.solver import Basis, Infeasible, SolverFailure, solve
@@ -61,8 +62,12 @@ class Prices:
     stock: Annotated[Floats, "θ at the knots, shape (knots, stores, functions), objective/mass"]
     reference: Annotated[Floats, "what is expected of stocks but for disturbances, shape (steps − 1, stores), mass"]
     response: Annotated[Floats, "what past disturbances add to it, of ``past_of`` them, shape (functions', stores)"]
-    service: Annotated[Floats, "μ ≥ 0 of the mean level of each service, shape (services,)"]
-    demand: Annotated[Floats, "the expected level demanded of each, shape (services,)"]
+    service: Annotated[
+        Floats,
+        "μ ≥ 0 of the mean level of each service, and of minus what is booked of each budget, in parts of it, shape "
+        "(services + budgets,)",
+    ]
+    demand: Annotated[Floats, "what is expected of each at least, likewise"]
     shocks: Annotated[Floats, "κ, what is new adds to a draw, at start and end, shape (2, functions), objective"]
 
     def weights(self, new: Floats) -> Floats:
@@ -88,7 +93,7 @@ class Prices:
         return float((shocks(new) * self.shocks).sum())
 
     def service_value(self, levels: Floats) -> Floats:
-        """Return Σ_s μ_s (level_s − demand_s) of mean levels, shape (..., services)."""
+        """Return Σ_s μ_s (level_s − demand_s) of mean levels, those of budgets included, (..., services + budgets)."""
         return np.asarray((levels - self.demand) @ self.service)
 
 
@@ -135,18 +140,26 @@ class DrawProgram:
     """The program of a draw: its own rows, boxes and kernels; prices change its costs alone."""
 
     def __init__(
-        self, draw: Draw, agents: Sequence[str] | None, degree: int, service_weight: float | None = None
+        self,
+        draw: Draw,
+        agents: Sequence[str] | None,
+        degree: int,
+        service_weight: float | None = None,
+        *,
+        aims: Aims = NO_AIMS,
     ) -> None:
-        """Write the rows down.
+        """Write the rows down; of ``aims`` the budgets count, which are no rows but have prices.
 
         Raises:
             NoCertificate: for a network whose flows are not linear laws.
         """
         admissible = Admissible.of(draw.network, agents)
-        self.draw, self._totals = draw, admissible.lifetimes.totals
+        self.draw, self.aims, lifetimes = draw, aims, admissible.lifetimes
+        self._totals = lifetimes.totals
         self._programs = Programs(admissible, degree, service_weight, constant_shares=False, large=LARGE_DRAW)
         self.problem = self._programs.program(draw.initial)
         self.layout = self.problem.layout
+        self.bookings = account_rows(lifetimes, self.layout, draw.initial, aims.rates(lifetimes.network))
 
     def with_prices(self, prices: Prices) -> Program:
         """Return the program under ``prices``."""
@@ -161,9 +174,11 @@ class DrawProgram:
         problem, layout = self.problem, self.layout
         cost = problem.cost.reshape(-1, layout.size).copy()
         cost[:-1, layout.last] += weights @ self._totals
-        cost[:, layout.level : layout.imbalance] -= prices.service / len(cost)
+        services = layout.imbalance - layout.level
+        cost[:, layout.level : layout.imbalance] -= prices.service[:services] / len(cost)
         constant = problem.constant + constant - float(prices.service @ prices.demand)
-        return replace(problem, cost=cost.ravel(), constant=constant)
+        (rows, beside), by_amount = self.bookings, prices.service[services:] / self.aims.sizes
+        return replace(problem, cost=cost.ravel() + by_amount @ rows, constant=constant - float(by_amount @ beside))
 
     def prove(self, problem: Program, basis: Basis | None = None, substitutes: Sequence[Certificate] = ()) -> DrawProof:
         """Solve the program under some prices, and return what its multipliers prove.
@@ -203,9 +218,10 @@ class DrawProgram:
         return np.asarray(ends @ self._totals.T)
 
     def levels(self, plan: Floats) -> Floats:
-        """Return the mean level of each service under a plan, shape (services,)."""
-        layout = self.layout
-        return np.asarray(plan.reshape(-1, layout.size)[:, layout.level : layout.imbalance].mean(axis=0))
+        """Return mean levels under a plan, as ``Prices.service`` has them, shape (services + budgets,)."""
+        layout, (rows, beside) = self.layout, self.bookings
+        levels = plan.reshape(-1, layout.size)[:, layout.level : layout.imbalance].mean(axis=0)
+        return np.append(levels, -(rows @ plan + beside) / self.aims.sizes)
 
     def stock_values(self, certificate: Certificate) -> Floats:
         """Return what a mass more in a stock at the start of intervals 1, 2, … is worth, shape (steps − 1, stores)."""

@@ -167,6 +167,8 @@ class MPC(Planner):
         aims.refuse_years("MPC", "plans know what is left of a total, not of a year; take optimum control")
         self._levels = None if self._min_service is None else demanded_levels(network, self._min_service)
         self.note, self._env, is_disturbed = "", env, bool(network.disturbed)
+        if self._prices is not None and len(self._prices.service) > len(network.services):
+            raise CirlError("prices: those of a bound with budgets, which no plan of one interval can keep")
         if horizon is not None and aims.budgets and not is_disturbed:
             raise CirlError(f"horizon {horizon}: whether a budget is kept depends on the whole episode; leave it out")
         self._horizon = (WINDOW if self._prices is None else 1) if horizon is None and is_disturbed else horizon

@@ -85,11 +85,11 @@ class Sample:
         return stocks.mean(axis=0) - past.mean(axis=0) @ response, response
 
     def levels(self, trial: PriceTrial) -> Floats:
-        """Return the levels of each draw, shape (draws, services)."""
+        """Return the levels of each draw, those of budgets included, shape (draws, services + budgets)."""
         return np.array([program.levels(plan) for program, plan, _ in self._optima(trial)])
 
     def slopes(self, trial: PriceTrial) -> tuple[Floats, Floats]:
-        """Return subgradients of ``values``: by θ, (draws, knots, stores, functions), and by μ, (draws, services)."""
+        """Return subgradients of ``values``: by θ, (draws, knots, stores, functions), and by μ, as ``levels``."""
         prices, by_stock = trial.prices, []
         for program, plan, _ in self._optima(trial):
             apart = program.stocks(plan) - prices.expected_stocks(program.draw.features)
@@ -139,28 +139,29 @@ def fit_prices(
 
     Args:
         programs: of the draws; every other one chooses among what the rest suggests.
-        demand: expected level demanded of each service, shape (services,); empty if nothing is demanded.
+        demand: expected level demanded of each service, shape (services,); empty if nothing is demanded. Budgets are
+            those of the programs.
         scale: size of the objective, from which prices on services start.
         progress: called with the share that is done.
 
     Raises:
-        CirlError: if not even who knows the future reaches the demanded levels in these draws.
+        CirlError: if not even who knows the future reaches the demanded levels, or keeps the budgets, in these draws.
     """
-    first = programs[0].draw
+    first, aims = programs[0].draw, programs[0].aims
     steps, functions = first.new.shape
     stores, services = len(first.network.stores), len(first.network.services)
     free = Prices(
         stock=np.zeros((KNOTS, stores, functions)),
         reference=np.zeros((steps, stores)),
         response=np.zeros((past_of(first.features).shape[1], stores)),
-        service=np.zeros(services),
-        demand=demand if len(demand) else np.zeros(services),
+        service=np.zeros(services + len(aims.budgets)),
+        demand=np.append(demand if len(demand) else np.zeros(services), -aims.limits / aims.sizes),
         shocks=np.zeros((2, functions)),
     )
     sample, judges = Sample(programs[::2]), Sample(programs[1::2])
     trial = sample(free)
-    if len(demand):
-        trial = improve(sample, [trial], np.zeros_like(free.stock), scale)[-1]
+    if len(demand) or aims.budgets:
+        trial = improve(sample, [trial], np.zeros_like(free.stock), scale, len(demand) > 0)[-1]
         _check_reach(sample, trial, scale)
     progress(0.3)
     clairvoyant, trials = trial.prices, [trial]
@@ -189,14 +190,16 @@ def _worth_of_shocks(draws: Sequence[Floats], *trials: PriceTrial) -> Floats:
 
 
 def _check_reach(sample: Sample, trial: PriceTrial, scale: float) -> None:
-    """Refuse levels that are missed at any price."""
-    prices, levels = trial.prices, sample.levels(trial).mean(axis=0)
+    """Refuse levels that are missed, and budgets that are exceeded, at any price."""
+    prices, levels, first = trial.prices, sample.levels(trial).mean(axis=0), sample.programs[0]
+    network, aims, count = first.draw.network, first.aims, len(sample.programs)
+    services = len(network.services)
     for s in np.flatnonzero((levels < prices.demand - SHORT) & (prices.service > OUT_OF_REACH * scale)).tolist():
-        name = sample.programs[0].draw.network.services[s].id
-        raise CirlError(
-            f"no policy reaches an expected level of {prices.demand[s]:g} of '{name}' (at most {levels[s]:.6g} in "
-            f"{len(sample.programs)} draws)"
-        )
+        if s < services:
+            text = f"reaches an expected level of {prices.demand[s]:g} of '{network.services[s].id}' (at most"
+            raise CirlError(f"no policy {text} {levels[s]:.6g} in {count} draws)")
+        budget, least = aims.budgets[s - services], -levels[s] * aims.sizes[s - services]
+        raise CirlError(f"no policy keeps an expected {budget.text(network)} (at least {least:.6g} in {count} draws)")
 
 
 def improve(
@@ -220,10 +223,11 @@ def improve(
     Returns:
         Trials each of which was better than all before, the best last.
     """
-    free, services = stock_scales > 0, len(trials[0].prices.service)
-    count = int(free.sum())
-    units = np.concatenate([STOCK_WIDTH * stock_scales[free], np.full(services, scale)])
-    width = np.concatenate([np.ones(count), np.full(services, 1.0 if has_demand else 0.0)])
+    free, constraints = stock_scales > 0, len(trials[0].prices.service)
+    count, services = int(free.sum()), len(sample.programs[0].draw.network.services)
+    units = np.concatenate([STOCK_WIDTH * stock_scales[free], np.full(constraints, scale)])
+    width = np.ones(count + constraints)
+    width[count : count + services] = 1.0 if has_demand else 0.0
     cuts, places = _Cuts(), []
     for trial in trials:
         places.append(np.concatenate([trial.prices.stock[free], trial.prices.service]) / units)

@@ -15,6 +15,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import frozen_record
+from cirl_marl.optimum.aims import NO_AIMS, Aims, budget_texts
 from cirl_marl.optimum.certificate import Certificate, verify
 from cirl_marl.optimum.draw_proofs import Sampling, draw, prove_draws
 from cirl_marl.optimum.draws import DrawProgram, Prices
@@ -34,8 +35,8 @@ NOTHING = 1e-6
 class UncertainBound:
     """What the mean of λ̄ does not exceed under any policy that does not foresee, from draws with a certificate each.
 
-    Every policy that delivers the demanded services on average has E[λ̄] ≤ E[values], and every other one
-    E[λ̄ + Σ_s μ_s (level_s − demand_s)] ≤ E[values].
+    Every policy that delivers the demanded services and keeps the budgets on average has E[λ̄] ≤ E[values], and every
+    other one E[λ̄ + Σ_s μ_s (level_s − demand_s) + Σ_b μ_b (budget_b − amount_b)] ≤ E[values].
     """
 
     network: Annotated[Network, "the network, under its scenario and horizon"]
@@ -52,6 +53,7 @@ class UncertainBound:
     informed_luck: Annotated[Floats, "likewise, of ``informed_values``"]
     gross_mass: Annotated[Floats, "gross mass that λ counts in the plan of each draw, Δ·Σ|σ_k|·f̄_k, NaN without a plan"]
     certificates: Annotated[tuple[Certificate, ...], "multipliers of the program of each draw"]
+    aims: Annotated[Aims, "budgets of expected amounts on accounts"] = NO_AIMS
 
     @property
     def value(self) -> float:
@@ -100,12 +102,26 @@ class UncertainBound:
         """Numbers drawn once per episode, which the bound knows from the start and a policy does not."""
         return tuple(self.network.uncertain) if self.draws_numbers else ()
 
-    def gaps(self, circularity: ArrayLike, levels: ArrayLike, *, with_foresight: bool = False) -> Floats:
+    @property
+    def budget_prices(self) -> dict[str, float]:
+        """What the bound falls by with one unit less of each expected amount, to first order, mass per unit."""
+        multipliers = self.prices.service[len(self.network.services) :] / self.aims.sizes
+        return dict(zip((budget.name for budget in self.aims.budgets), multipliers.tolist(), strict=True))
+
+    def gaps(
+        self,
+        circularity: ArrayLike,
+        levels: ArrayLike,
+        bookings: ArrayLike | None = None,
+        *,
+        with_foresight: bool = False,
+    ) -> Floats:
         """Return (bound − λ̄ − Σ_s μ_s (level_s − demand_s))/scale of each draw under a policy; its gap is their mean.
 
         Args:
             circularity: λ̄ of the episodes, shape (draws,), or (any,) of the first draws.
             levels: mean level of each service, shape (draws, services).
+            bookings: what is booked of each budget (``aims.bookings``), (draws, budgets); None where there are none.
             with_foresight: whether it is held against who knows the future instead.
 
         Raises:
@@ -118,7 +134,12 @@ class UncertainBound:
                 f"gaps: circularity of shape {np.shape(circularity)} and levels of shape {np.shape(levels)}; expected "
                 f"(draws,), at most {len(values)} draws, and (draws, {services})"
             )
-        merit = np.asarray(circularity, dtype=float) + prices.service_value(np.asarray(levels, dtype=float))
+        amounts = np.zeros((count, 0)) if bookings is None else np.asarray(bookings, dtype=float)
+        if amounts.shape != (count, len(self.aims.budgets)):
+            expected = f"expected {(count, len(self.aims.budgets))}, what is booked of each budget"
+            raise CirlError(f"gaps: bookings of shape {amounts.shape}; {expected}")
+        constraints = np.concatenate([np.asarray(levels, dtype=float), -amounts / self.aims.sizes], axis=1)
+        merit = np.asarray(circularity, dtype=float) + prices.service_value(constraints)
         return np.asarray((values[: len(merit)] - merit) / self.scale)
 
     def closure(self, foresight_gap: float) -> float:
@@ -129,13 +150,15 @@ class UncertainBound:
     def as_dict(self) -> dict[str, Any]:
         """Return its figures, ready for JSON."""
         ids = [service.id for service in self.network.services]
+        prices = {"budget_prices": self.budget_prices} if self.aims.budgets else {}
         names = ("value", "upper", "perfect_information", "scale", "failures")
         return {name: getattr(self, name) for name in names} | {
             "draws": len(self.values),
             "fit_draws": self.sampling.fit_draws,
             "seed": self.sampling.seed,
             "draws_numbers": self.draws_numbers,
-            "service_prices": dict(zip(ids, self.prices.service.tolist(), strict=True)),
+            "service_prices": dict(zip(ids, self.prices.service[: len(ids)].tolist(), strict=True)),
+            **prices,
         }
 
     def verify(self) -> float:
@@ -143,7 +166,8 @@ class UncertainBound:
         first, numbers, proofs = first_seed(self.sampling.seed), self.sampling.numbers, []
         draws = draw(self.network, self.agents, self.initial, numbers, first, len(self.values))
         for future, certificate in zip(draws, self.certificates, strict=True):
-            problem = DrawProgram(future, self.agents or None, self.degree).with_prices(self.prices)
+            program = DrawProgram(future, self.agents or None, self.degree, aims=self.aims)
+            problem = program.with_prices(self.prices)
             proved = verify(problem, certificate, np.zeros(len(problem.cost))).bound
             proofs.append(proved - self.prices.luck(future.new))
         return float(np.mean(proofs))
@@ -153,6 +177,7 @@ class UncertainBound:
         mass, demand = self.network.mass_unit, ""
         if self.min_service is not None and self.network.services:
             demand = f", expected service level at least {levels_text(self.network, self.min_service)}"
+        demand += "".join(f", expected {text}" for text, _ in budget_texts(self.network, self.aims))
         hidden = (
             f"; it knows from the start what a policy does not: {', '.join(self.hidden_numbers)}"
             if self.hidden_numbers
@@ -173,12 +198,13 @@ def uncertain_bound(
     min_service: Floats | None,
     degree: int,
     sampling: Sampling,
+    aims: Aims = NO_AIMS,
     progress: Callable[[float], None] = lambda share: None,
 ) -> UncertainBound:
     """Bound the mean of λ̄ of policies that do not foresee; see ``bound``, which checks the arguments.
 
     Raises:
-        CirlError: if nothing is uncertain, the program of a draw is too large, or services are out of reach.
+        CirlError: if nothing is uncertain, the program of a draw is too large, or services or budgets are out of reach.
         NoCertificate: for a network whose flows are not linear laws.
     """
     sampling = sampling.validate()
@@ -190,13 +216,13 @@ def uncertain_bound(
     futures = draw(network, agents, start, sampling.numbers, first + SEED_SPACING // 2, sampling.fit_draws)
     programs = []
     for future in futures:
-        programs.append(DrawProgram(future, agents, degree))
+        programs.append(DrawProgram(future, agents, degree, aims=aims))
         check_size(programs[-1])
     demand = np.zeros(0) if min_service is None else min_service
     scale = network.objective.circularity_scale
     clairvoyant, prices = fit_prices(programs, demand, scale, progress=lambda share: progress(0.3 * share))
     proofs = prove_draws(
-        network, actors, start, degree, sampling, (clairvoyant, prices), lambda share: progress(0.3 + 0.7 * share)
+        network, actors, start, degree, sampling, (clairvoyant, prices), aims, lambda share: progress(0.3 + 0.7 * share)
     )
     return UncertainBound(
         network=network,
@@ -213,6 +239,7 @@ def uncertain_bound(
         informed_luck=proofs.luck[:, 0],
         gross_mass=proofs.gross_mass,
         certificates=proofs.certificates,
+        aims=aims,
     )
 
 
