@@ -1054,7 +1054,7 @@ def test_what_no_file_holds_is_refused_before_anything_is_simulated(
 
 
 def test_the_command_writes_years_of_scenarios_and_controls(tmp_path: Path) -> None:
-    """Of as many steps as are asked for."""
+    """Of as many steps as are asked for, which scenarios may differ in otherwise."""
     path, controls = tmp_path / "iamc.csv", ["--control", "neutral", "--control", "random"]
     options = ["--steps", "2", "--out", str(tmp_path), "--iamc", str(path)]
     done = CliRunner().invoke(app, ["simulate", "steel_japan", *controls, *options])
@@ -1062,6 +1062,13 @@ def test_the_command_writes_years_of_scenarios_and_controls(tmp_path: Path) -> N
     rows = read_iamc(path)
     assert {row.scenario for row in rows} == {"steel_japan default neutral", "steel_japan default random"}
     assert {tuple(row.values) for row in rows} == {(2025, 2026)}
+    file = tmp_path / "japan.toml"
+    write_network(load_network("steel_japan"), file)
+    short = '\n[scenarios.short.episode]\nhorizon = { value = 3, unit = "1", source = "chosen" }\n'
+    file.write_text(file.read_text(encoding="utf-8") + short, encoding="utf-8")
+    done = CliRunner().invoke(app, ["simulate", str(file), "--scenario", "default", "--scenario", "short", *options])
+    assert done.exit_code == 0, done.output
+    assert {row.scenario for row in read_iamc(path)} == {"steel_japan default neutral", "steel_japan short neutral"}
 
 
 def _size(simulation: Simulation) -> int:

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from small_networks import ACCOUNTS, booked, small
-from test_accounts import city
+from test_accounts import city, first_window
 from test_optimum import bounded, pinned
 from typer.testing import CliRunner
 
@@ -37,7 +37,7 @@ from cirl_marl.controllers import Random
 from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.optimum import improve, improve_plan, simulate_plan, smooth_plan
-from cirl_marl.optimum.aims import aims_of
+from cirl_marl.optimum.aims import aims_of, budget_texts
 from cirl_marl.optimum.linearised import jacobians, step_program
 
 
@@ -150,10 +150,10 @@ def test_plans_keep_the_budget_of_each_year(monkeypatch: pytest.MonkeyPatch, mos
 
 
 def test_a_step_of_a_plan_knows_what_each_year_books() -> None:
-    """To first order, stocks included, as the simulator does."""
+    """To first order, stocks included, as the simulator does; what is discounted in all is not within a year."""
     network = yearly(4)
     stores = [replace(node, holding={"emissions": 0.05}) if node.stores else node for node in network.nodes]
-    network = replace(network, nodes=tuple(stores))
+    network = replace(network, nodes=tuple(stores), accounts=tuple(replace(a, discount=0.3) for a in ACCOUNTS))
     solved = bound(network, min_service=0.5, at_most={"emissions/year": 3000.0, "emissions": 9000.0})
     rng, dynamics = np.random.default_rng(0), Dynamics(network)
     middle = replace(solved, actions=rng.uniform(-0.5, 0.5, solved.actions.shape))
@@ -225,3 +225,18 @@ def test_a_weight_of_circularity_alone_scales_the_bound() -> None:
     once, twice = (bound(network, aim={"circularity": weight}) for weight in (1.0, 2.0))
     assert twice.objective == pytest.approx(2 * once.objective, rel=1e-6)
     assert str(twice).partition("2·λ̄ ≤ ")[2].startswith(f"{twice.objective:.6g}")
+    plans = [first_window(MPC(aim={"circularity": weight}, min_service=0.5), network) for weight in (1.0, 2.0)]
+    promises = [float(plan.problem.cost @ plan.solution.plan) for plan in plans]
+    assert promises[1] == pytest.approx(2 * promises[0], rel=1e-4) and promises[0] > 0
+    assert plans[1].value == pytest.approx(2 * plans[0].value, rel=1e-4)
+
+
+def test_each_account_has_a_text_of_its_own() -> None:
+    """Of the years of one there is one, and of another another."""
+    network = yearly(2)
+    aims = aims_of(network, "circularity", {"emissions/year": 5.0, "cost/year": 1e4, "cost": 3e4})
+    assert budget_texts(network, aims) == [
+        ("emissions at most 5 t CO2e a year", ["emissions in year 1", "emissions in year 2"]),
+        ("cost at most 10000 EUR_2023 a year", ["cost in year 1", "cost in year 2"]),
+        ("cost at most 30000 EUR_2023", ["cost"]),
+    ]

@@ -198,8 +198,9 @@ def _check_reach(sample: Sample, trial: PriceTrial, scale: float) -> None:
         if s < services:
             text = f"reaches an expected level of {prices.demand[s]:g} of '{network.services[s].id}' (at most"
             raise CirlError(f"no policy {text} {levels[s]:.6g} in {count} draws)")
-        budget, least = aims.budgets[s - services], -levels[s] * aims.sizes[s - services]
-        raise CirlError(f"no policy keeps an expected {budget.text(network)} (at least {least:.6g} in {count} draws)")
+        budget, amount = aims.budgets[s - services], -levels[s] * aims.sizes[s - services]
+        note = f"(at the highest price that was tried {count} draws come to {amount:.6g})"
+        raise CirlError(f"no policy keeps an expected {budget.text(network)} {note}")
 
 
 def improve(
