@@ -90,6 +90,7 @@ if TYPE_CHECKING:
     from cirl_marl.network.elements import Observation as Observation
     from cirl_marl.network.elements import Role as Role
     from cirl_marl.network.elements import Service as Service
+    from cirl_marl.network.elements import Substance as Substance
     from cirl_marl.network.network import Network as Network
     from cirl_marl.network.series import Series as Series
     from cirl_marl.optimum.admissible import NoCertificate as NoCertificate
@@ -160,7 +161,9 @@ _MODULES = {
     "learners.recipe": "Recipe load_recipe",
     "learners.teams.team": "Team independent",
     "learners.trainer": "Training",
-    "network.elements": "Account Arc Control ControlKind Episode Law Node Objective Observation Role Service",
+    "network.elements": (
+        "Account Arc Control ControlKind Episode Law Node Objective Observation Role Service Substance"
+    ),
     "network.network": "Network",
     "network.series": "Series",
     "optimum.admissible": "NoCertificate",

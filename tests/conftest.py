@@ -17,7 +17,20 @@ import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
-from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Objective, Role, Series, Service
+from cirl_marl import (
+    Arc,
+    Control,
+    ControlKind,
+    Episode,
+    Law,
+    Network,
+    Node,
+    Objective,
+    Role,
+    Series,
+    Service,
+    Substance,
+)
 from cirl_marl.definitions.reader import Definition
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.network.elements import FIXED_LIFETIME, Lifetime
@@ -211,6 +224,49 @@ def random_network(seed: int, nodes: int, arcs: int, *, runge_kutta: bool = Fals
         return network
     step = interval / Dynamics(network).substeps
     return network.with_options(episode={"solver": "rk4", "solver_step": step})
+
+
+def with_substances(network: Network, seed: int) -> Network:
+    """Return a network with one or two substances, some of which nodes separate, and limits on contents.
+
+    Batches and what recipients draw become schedules, as they do not follow substances.
+    """
+    rng = np.random.default_rng([seed, 3])
+    names = [f"substance_{i}" for i in range(int(rng.integers(1, 3)))]
+    nodes = []
+    for node in network.nodes:
+        parts = rng.dirichlet([1.0] * (len(names) + 1))[1:] * rng.integers(2, size=len(names))
+        nodes.append(replace(node, content=dict(zip(names, parts.tolist(), strict=True)) if node.stores else {}))
+    first = next(i for i, node in enumerate(nodes) if node.stores)
+    nodes[first] = replace(nodes[first], content=dict.fromkeys(names, 0.3))
+    rests = {arc.donor for arc in network.arcs if arc.law is Law.SHARE and arc.share is None and arc.control is None}
+    arcs = []
+    for arc in network.arcs:
+        if arc.law in (Law.BATCH, Law.RECIPIENT):
+            flow = float(rng.uniform(0, 50))
+            arc = Arc(id=arc.id, donor=arc.donor, recipient=arc.recipient, law=Law.EXOGENOUS, flow=flow)
+        elif arc.law is Law.SHARE and arc.donor in rests and not (arc.share is None and arc.control is None):
+            separated = [name for name in names if rng.random() < 0.4]
+            if arc.control is None and separated and rng.random() < 0.3:
+                low, neutral, high = np.sort(rng.uniform(0, 0.045, 3)).tolist()
+                control = Control(
+                    kind=ControlKind.TRANSFER, low=low, neutral=neutral, high=high, substances=tuple(separated)
+                )
+                arc = replace(arc, control=control)
+            elif separated:
+                arc = replace(arc, transfer=dict.fromkeys(separated, float(rng.uniform(0, 0.045))))
+        arcs.append(arc)
+    carried = {arc.id for arc in network.arcs if arc.law is Law.BATCH}
+    services = [s for s in network.services if s.quantity != "stock" or carried.isdisjoint(s.providers)]
+    services += [
+        replace(s, id=f"{s.id}_content", substance=names[0], low=0.0, high=float(rng.uniform(0.01, 0.5)))
+        for s in services
+        if rng.random() < 0.5
+    ]
+    substances = tuple(Substance(id=name, scale=0.1) for name in names)
+    return replace(
+        network, nodes=tuple(nodes), arcs=tuple(arcs), services=tuple(services), substances=substances, scenarios={}
+    )
 
 
 def limited(arcs: list[Arc], holders: list[str], seed: int, length: float) -> list[Arc]:

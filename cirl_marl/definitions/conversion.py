@@ -85,6 +85,10 @@ class Converter:
             "accounts": tuple(
                 self._part(elements.Account, part, f"accounts.{id_}", id=id_) for id_, part in table.accounts.items()
             ),
+            "substances": tuple(
+                self._part(elements.Substance, part, f"substances.{id_}", id=id_)
+                for id_, part in table.substances.items()
+            ),
             "episode": self._part(elements.Episode, table.episode, "episode"),
             "objective": self._part(elements.Objective, table.objective, "objective"),
             "observation": self._part(elements.Observation, table.observation, "observation"),
@@ -144,7 +148,7 @@ class Converter:
                 self.mistakes.append(f"{path}: {value} must be a whole number of control intervals")
             return int(value)
         if isinstance(declaration, Rates):
-            return {account: self._rate(declaration, account, rate, path) for account, rate in entry.items()}
+            return {id_: self._named_value(declaration, id_, value, path) for id_, value in entry.items()}
         if isinstance(declaration, Subtable) and declaration.of in SUBRECORDS:
             return self._part(SUBRECORDS[declaration.of], entry, path)
         if isinstance(entry, Range):
@@ -162,15 +166,17 @@ class Converter:
             return tuple(map(tuple, entry))
         return tuple(entry) if isinstance(entry, list) else entry
 
-    def _rate(self, declaration: Rates, account: str, rate: Any, path: str) -> Value:
-        """Return what is charged on an account."""
-        if account not in self.table.accounts:
-            self.mistakes.append(f"{path}: {unknown_name('account', account, self.table.accounts)}")
+    def _named_value(self, declaration: Rates, id_: str, entry: Any, path: str) -> Value:
+        """Return what is charged on an account, or a part of a substance."""
+        tables: Any = getattr(self.table, f"{declaration.of}s")
+        if id_ not in tables:
+            self.mistakes.append(f"{path}: {unknown_name(declaration.of, id_, tables)}")
             return 0.0
+        if declaration.of == "substance":
+            return self._value(entry, "1", f"{path}.{id_}")
         units = self.table.units
         per = f"({units.mass})" if declaration.per == "mass" else f"(({units.mass})*({units.time}))"
-        table: Any = self.table.accounts[account]
-        return self._value(rate, f"({table.unit})/{per}", f"{path}.{account}")
+        return self._value(entry, f"({tables[id_].unit})/{per}", f"{path}.{id_}")
 
     def _record(self, entry: RecordColumn, path: str) -> tuple[float, ...]:
         texts = {key: self._with_region(text, f"{path}.where.{key}") for key, text in entry.where.items()}
@@ -259,10 +265,15 @@ class Converter:
         ends = ("low", "neutral", "high")
         sides = {side: self._in_time(getattr(control, side), unit, f"{path}.{side}") for side in ends}
         self._disturb(control, control.unit, target or "1", f"{path}.high")
-        result = Control(kind=control.kind, **sides)
+        result = Control(kind=control.kind, **sides, substances=tuple(control.substances))
         self._spread(control, result.nominal, unit, path)
         most = extremes(result.nominal)[1]
-        if control.kind is ControlKind.SHARE and control.range is None and path in self.uncertain and most > 0:
+        if (
+            control.kind in (ControlKind.SHARE, ControlKind.TRANSFER)
+            and control.range is None
+            and path in self.uncertain
+            and most > 0
+        ):
             self.uncertain[path] = replace(self.uncertain[path], high=1 / most)  # no share is more than 1
         return result
 

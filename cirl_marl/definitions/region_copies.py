@@ -125,9 +125,10 @@ def _strangers(pattern: Document, change: Document, prefix: str) -> Iterator[str
 
 
 def _add_common(document: dict[str, Any], pattern: dict[str, Any], regions: Sequence[str]) -> None:
-    """Move accounts and disturbances that regions share to ``document``, and write out what correlates them."""
-    if "accounts" in pattern:
-        document["accounts"] = {**pattern["accounts"], **document.get("accounts", {})}
+    """Move what regions share, such as accounts, to ``document``, and write out what correlates disturbances."""
+    for key in ("accounts", "substances"):
+        if key in pattern:
+            document[key] = {**pattern[key], **document.get(key, {})}
     own = pattern.get("disturbances", {})
     common = {name: part for name, part in own.items() if isinstance(part, Mapping) and part.get("common") is True}
     if own:

@@ -37,6 +37,7 @@ from cirl_marl.network.elements import (
     Objective,
     Observation,
     Service,
+    Substance,
 )
 
 Identifier = Annotated[str, Field(pattern=IDENTIFIER)]
@@ -127,7 +128,8 @@ def _field_type(declaration: Declaration, hint: Any) -> Any:
     if isinstance(declaration, CalendarTime):
         return quantities.Time
     if isinstance(declaration, Rates):
-        return dict[Identifier, VaryingQuantity]  # type: ignore[valid-type]
+        number = VaryingQuantity if declaration.number.varies else FixedQuantity
+        return dict[Identifier, number]  # type: ignore[valid-type]
     if isinstance(declaration, Quantity) and declaration.unit_of_table:
         return quantities.Number
     if isinstance(declaration, Quantity) and declaration.past:
@@ -167,6 +169,7 @@ NodeTable = table_of(Node)
 ArcTable = table_of(Arc)
 ServiceTable = table_of(Service)
 AccountTable = table_of(Account)
+SubstanceTable = table_of(Substance)
 EpisodeTable = table_of(Episode)
 ObjectiveTable = table_of(Objective)
 ObservationTable = table_of(Observation)
@@ -248,6 +251,9 @@ class NetworkTable(quantities.Table):
     services: dict[Identifier, ServiceTable] = Field({})  # type: ignore[valid-type]
     accounts: dict[Identifier, AccountTable] = Field(  # type: ignore[valid-type]
         {}, description="what is counted beside mass: money, emissions, energy"
+    )
+    substances: dict[Identifier, SubstanceTable] = Field(  # type: ignore[valid-type]
+        {}, description="what the material has in it, such as tramp elements, alloys or additives"
     )
     disturbances: dict[Identifier, DisturbanceTable] = Field(
         {}, description="processes in time that disturb the quantities that name them in ``disturbed_by``"

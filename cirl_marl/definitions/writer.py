@@ -50,7 +50,7 @@ def _toml_tables(document: dict[str, Any]) -> tomlkit.TOMLDocument:
     """Lay settings and compartments out as tables with a line for each key."""
     layout = tomlkit.document()
     for key, value in document.items():
-        if key in ("nodes", "arcs", "services", "accounts", "disturbances") and value:
+        if key in ("nodes", "arcs", "services", "accounts", "substances", "disturbances") and value:
             layout[key] = tomlkit.table(is_super_table=True)
             for id_, part in value.items():
                 layout[key][id_] = _fill_table(tomlkit.table(), part)
@@ -91,7 +91,11 @@ class _Writer:
                 key: {part.id: self._part(part, f"{key}.{part.id}") for part in getattr(network, key)}
                 for key in ("nodes", "arcs", "services")
             },
-            **({"accounts": {part.id: self._part(part) for part in network.accounts}} if network.accounts else {}),
+            **{
+                key: {part.id: self._part(part) for part in parts}
+                for key in ("accounts", "substances")
+                if (parts := getattr(network, key))
+            },
             **self._disturbances(),
         }
 
@@ -129,8 +133,8 @@ class _Writer:
                 table |= {key: float(value), "unit": unit_, "source": SOURCE}
             elif isinstance(declaration, declarations.Rates):
                 table[key] = {
-                    account: self._number(rate, f"{path}.{name}.{account}", self._rate_unit(declaration, account))
-                    for account, rate in value
+                    id_: self._number(number, f"{path}.{name}.{id_}", self._named_unit(declaration, id_))
+                    for id_, number in value
                 }
             elif isinstance(declaration, declarations.Quantity):
                 table[key] = self._number(value, f"{path}.{name}", self._units.get(declaration.kind(part), "1"))
@@ -162,11 +166,13 @@ class _Writer:
         number = self._quantity(value, "1") | {"unit": unit} | _spread_keys(self._network.uncertain.get(path), value)
         return number | self._disturbance_keys(path)
 
-    def _rate_unit(self, declaration: declarations.Rates, account: str) -> str:
+    def _named_unit(self, declaration: declarations.Rates, id_: str) -> str:
+        if declaration.of == "substance":
+            return "1"
         units = {account.id: account.unit for account in self._network.accounts}
         per = f"({self._units['mass']})"
         per = per if declaration.per == "mass" else f"({per}*({self._units['time']}))"
-        return f"({units[account]})/{per}"
+        return f"({units[id_]})/{per}"
 
     def _control(self, part: Compartment) -> dict[str, Any]:
         control = part.control
@@ -176,7 +182,8 @@ class _Writer:
             unit = part.model.input_unit or "1"
         sides = {"low": control.low, "neutral": control.neutral, "high": control.high}
         bounds = {side: self._series(at) if isinstance(at, Series) else float(at) for side, at in sides.items()}
-        return {"kind": control.kind.value, **bounds, "unit": unit, "source": SOURCE}
+        substances = {"substances": list(control.substances)} if control.substances else {}
+        return {"kind": control.kind.value, **bounds, **substances, "unit": unit, "source": SOURCE}
 
     def _model(self, part: Compartment) -> dict[str, Any]:
         model: Any = part.model

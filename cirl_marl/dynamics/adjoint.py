@@ -61,7 +61,12 @@ class Adjoint:
         self._varying_drivers = self._taylor.driver[self._varying]
 
     def pull_back(
-        self, inputs: IntervalInputs, step: Integers, stock_adjoint: Floats, moved_adjoint: Floats
+        self,
+        inputs: IntervalInputs,
+        step: Integers,
+        stock_adjoint: Floats,
+        moved_adjoint: Floats,
+        substances_adjoint: Floats | None = None,
     ) -> IntervalInputs:
         """Return derivatives by what an interval starts from, of a functional of what it ends with.
 
@@ -70,6 +75,7 @@ class Adjoint:
             step: its index in each copy, shape (B,).
             stock_adjoint: derivatives by the masses after it, shape (masses, B); used up.
             moved_adjoint: by the mass that moved along each arc, shape (arcs, B).
+            substances_adjoint: by that of each substance, shape (substances · arcs, B), if there are any.
 
         Raises:
             CirlError: if a node was overdrawn by what its recipients drew; names it and the copy.
@@ -87,8 +93,7 @@ class Adjoint:
             drivers = self._drivers(stock, realised_rate, routes)
             trace.append((stock, realised_rate, drivers))
             stock = self._after(stock, realised_rate, drivers[-1])
-        rate_adjoint, moved = np.zeros_like(rate), np.zeros_like(rate)
-        moved[: len(moved_adjoint)] = moved_adjoint
+        rate_adjoint, moved = np.zeros_like(rate), dynamics.of_arcs_adjoint(moved_adjoint, substances_adjoint)
         stock_adjoint[dynamics.rows.unit] = 0.0
         for stock, realised_rate, drivers in reversed(trace):
             adjoint = np.zeros_like(rate)

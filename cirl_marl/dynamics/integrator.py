@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import Annotated
 
 import numpy as np
@@ -37,6 +37,9 @@ class Transition:
     stock: Annotated[Floats, "stocks after the interval with batch rows and unit row, shape (masses, B), mass"]
     inner: Annotated[Floats, "inner states of the models after the interval, shape (states, B)"]
     moved_mass: Annotated[Floats, "mass moved along each arc, by a batch arc delivered, shape (arcs, B), mass"]
+    moved_substances: Annotated[
+        Floats, "mass of each substance moved along each arc, shape (substances · arcs, B), mass"
+    ]
     flow: Annotated[Floats, "realised continuous flows at the end of the interval, shape (arcs, B), mass/time"]
     batch_mass: Annotated[
         Floats | None, "m_fb of its start and of its end, as in ``Network.circularity``, shape (2, 2, B), mass, if any"
@@ -139,8 +142,29 @@ class Dynamics(FlowLaws):
             total[self.batches.arcs] = deliveries
             batch_mass = np.stack([batch_start, batch_end])
         self._check_finite(stock, inner)
-        flow, arcs = self._flow_at(stock, inner, controls, actual_rate, routes), len(self.network.arcs)
-        return Transition(stock, inner, total[:arcs], flow[:arcs], batch_mass)
+        flow, _ = self.of_arcs(self._flow_at(stock, inner, controls, actual_rate, routes))
+        return Transition(stock, inner, *self.of_arcs(total), flow, batch_mass)
+
+    def of_arcs(self, flow: Floats) -> tuple[Floats, Floats]:
+        """Return what the arcs of the network carry, of all that is moved, shape (arcs of the simulator, B).
+
+        Returns:
+            The whole, shape (arcs, B), and of it each substance, shape (substances · arcs, B).
+        """
+        arcs, components = len(self.network.arcs), self.rows.components
+        if components == 1:
+            return flow[:arcs], flow[:0]
+        parts = flow.reshape(components, -1, flow.shape[1])[:, :arcs]
+        return reduce(np.add, parts), parts[1:].reshape(-1, flow.shape[1])
+
+    def of_arcs_adjoint(self, whole: Floats, substances: Floats | None = None) -> Floats:
+        """Return derivatives by all that is moved of those by what ``of_arcs`` returns; None: not by substances."""
+        arcs, components = len(self.network.arcs), self.rows.components
+        parts = np.zeros((components, len(self.staged_network.arcs) // components, whole.shape[1]))
+        parts[:, :arcs] = whole
+        if substances is not None:
+            parts[1:, :arcs] += substances.reshape(components - 1, arcs, -1)
+        return parts.reshape(-1, whole.shape[1])
 
     def rate_within_capacities(
         self, stock: Floats, controls: Floats, step: Integers | None, factors: Floats | None
@@ -163,8 +187,10 @@ class Dynamics(FlowLaws):
             f"{self.network.time_unit}; take a shorter solver_step or tighter bounds of the controls"
         )
 
-    def start_flow(self, stock: Floats, inner: Floats, controls: Floats, factors: Floats | None = None) -> Floats:
-        """Return the flows at the start of an episode, cut to what the donors hold, shape (arcs, B), mass/time."""
+    def start_flow(
+        self, stock: Floats, inner: Floats, controls: Floats, factors: Floats | None = None
+    ) -> tuple[Floats, Floats]:
+        """Return the flows at the start of an episode, cut to what the donors hold, mass/time; see ``of_arcs``."""
         first = np.zeros(stock.shape[1], dtype=np.intp)
         rate = self.rate_within_capacities(stock, controls, first, factors)
         if self.slots is not None:
@@ -173,16 +199,16 @@ class Dynamics(FlowLaws):
         if self.physical:
             rate = self.scheduled.cut(stock, rate)
         routes = self.routing.routes(rate)
-        flow, arcs = self._flow_at(stock, inner, controls, rate, routes), len(self.network.arcs)
+        flow = self._flow_at(stock, inner, controls, rate, routes)
         if not self._heedless:
-            return flow[:arcs]
+            return self.of_arcs(flow)
         out = self._outflow_sum(flow) * self.substep
         out[self.rows.unit] = 0.0
         share = np.divide(stock, out, out=np.ones_like(out), where=out > stock)
         flow *= share.take(self.rows.donors, axis=0)
         if routes is not None:
             self.routing.pass_on(flow, routes)
-        return flow[:arcs]
+        return self.of_arcs(flow)
 
     def _flow_at(
         self, stock: Floats, inner: Floats, controls: Floats, rate: Floats, routes: IntervalRoutes | None

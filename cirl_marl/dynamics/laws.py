@@ -18,9 +18,10 @@ from typing import Annotated
 
 import numpy as np
 
+from cirl_marl.dynamics.components import simulated_network
 from cirl_marl.dynamics.routing import Routing
 from cirl_marl.dynamics.shares import Shares
-from cirl_marl.dynamics.stages import StagedNetwork, simulated_network
+from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.dynamics.uncertain_factors import ControlFactors, FlowFactors, IntervalFactors
 from cirl_marl.errors import CirlError

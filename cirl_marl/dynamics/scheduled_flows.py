@@ -1,9 +1,15 @@
-"""Scheduled flows, and their cuts where a donor could be overdrawn."""
+"""Scheduled flows: their cuts where a donor could be overdrawn, and the components that they carry.
+
+In a network with substances what is asked for is of the whole. It carries each component c in the part x_c/Σx that it
+has of the donor's stock at the start of the substep: f_c = f·x_c/Σx.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
+from cirl_marl.dynamics.components import ComponentNetwork
+from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.compartment_model import Bools
 from cirl_marl.network.rowsum import RowSum
@@ -22,23 +28,49 @@ class ScheduledFlows:
     def __init__(self, network: Network, is_scheduled: Bools, driver: Integers, substep: float) -> None:
         """Find the donors of scheduled flows, and their outflows by schedule and in proportion to their stock."""
         self._substep = substep
-        self._arcs: Integers = np.flatnonzero(is_scheduled)
+        components = 1 + len(network.substances) if isinstance(network, ComponentNetwork) else 1
+        arcs, stores = len(network.arcs) // components, len(network.stores) // components
+        # what comes out of slots is of the component that is in them
+        own = {network.arc_index[arc] for arc in network.lines.values()} if isinstance(network, StagedNetwork) else ()
+        asked = [k for k in np.flatnonzero(is_scheduled).tolist() if k < arcs or k in own]
+        self._arcs: Integers = np.array(asked, dtype=np.intp)
         self._donors, place = np.unique(network.donors[self._arcs], return_inverse=True)
+        whole = np.flatnonzero([components > 1 and k not in own for k in self._arcs.tolist()])
+        part = np.arange(components)[:, None]
+        self._carried: Integers = (self._arcs[whole] + part * arcs).ravel()
+        self._carriers: Integers = np.tile(self._arcs[whole], components)
+        self._carried_rows: Integers = (network.donors[self._arcs[whole]] + part * stores).ravel()
+        self._carried_places: Integers = np.tile(place[whole], components)
+        several = np.unique(place[whole])
+        rows = (self._donors[several] + part[1:] * stores).ravel()
+        shape = (len(self._donors), stores * components)
+        self._others = RowSum(np.tile(several, components - 1), rows, 1.0, shape) if len(whole) else None
         self._slot: Integers = place
         slot = {int(node): i for i, node in enumerate(self._donors)}
         proportional = driver == network.donors
         exits = [k for k, d in enumerate(network.donors) if int(d) in slot and proportional[k]]
         exit_slot = [len(slot) + slot[int(network.donors[k])] for k in exits]
-        rows, columns = [*self._slot, *exit_slot], [*self._arcs, *exits]
-        self._outflows = RowSum(rows, columns, 1.0, (2 * len(slot), len(network.arcs)))
+        places, columns = [*self._slot, *exit_slot], [*self._arcs, *exits]
+        self._outflows = RowSum(places, columns, 1.0, (2 * len(slot), len(network.arcs)))
         self._sum = RowSum(self._slot, np.arange(len(self._arcs)), 1.0, (len(slot), len(self._arcs)))
 
     def cut(self, stock: Floats, rate: Floats) -> Floats:
         """Return the rates, shape (arcs, B), with those of scheduled flows cut; the same array if none is."""
         if not len(self._arcs):
             return rate
+        available_stock = self._stocks(stock)
+        rate = self._cut(available_stock, rate)
+        if self._others is None:
+            return rate
+        content = stock.take(self._carried_rows, axis=0)
+        whole = available_stock.take(self._carried_places, axis=0)
+        content = np.divide(content, whole, out=np.zeros_like(content), where=whole > 0)
+        carried = rate.copy()
+        carried[self._carried] = rate.take(self._carriers, axis=0) * content
+        return carried
+
+    def _cut(self, available_stock: Floats, rate: Floats) -> Floats:
         demand, turned_over = self._demand(rate)
-        available_stock = stock.take(self._donors, axis=0)
         if (demand <= available_stock * (1.0 - turned_over) * KEPT).all():
             return rate  # x·a/(e^{ah} − 1) ≥ x(1 − ah)/h: nothing can be overdrawn
         available = available_stock * _deliverable(turned_over) * KEPT
@@ -54,9 +86,38 @@ class ScheduledFlows:
         """
         if not len(self._arcs):
             return
+        available_stock = self._stocks(stock)
+        whole_adjoint = np.zeros_like(available_stock)
+        if self._others is not None:
+            self._pull_back_contents(stock, available_stock, rate, adjoint, stock_adjoint, whole_adjoint)
+        self._pull_back_cuts(available_stock, rate, adjoint, whole_adjoint)
+        np.add.at(stock_adjoint, self._donors, whole_adjoint)
+        if self._others is not None:
+            self._others.transpose().add_to(stock_adjoint[: self._others.shape[1]], whole_adjoint)
+
+    def _pull_back_contents(
+        self,
+        stock: Floats,
+        available_stock: Floats,
+        rate: Floats,
+        adjoint: Floats,
+        stock_adjoint: Floats,
+        whole_adjoint: Floats,
+    ) -> None:
+        """Turn, in place, the adjoint of what is carried into that of what is asked for, cut, and of the stocks."""
+        whole = available_stock.take(self._carried_places, axis=0)
+        per_whole = np.divide(1.0, whole, out=np.zeros_like(whole), where=whole > 0)
+        content = stock.take(self._carried_rows, axis=0) * per_whole
+        carried = adjoint.take(self._carried, axis=0)
+        by_part = carried * self._cut(available_stock, rate).take(self._carriers, axis=0) * per_whole
+        np.add.at(stock_adjoint, self._carried_rows, by_part)
+        np.add.at(whole_adjoint, self._carried_places, -by_part * content)
+        adjoint[self._carried] = 0.0
+        np.add.at(adjoint, self._carriers, carried * content)
+
+    def _pull_back_cuts(self, available_stock: Floats, rate: Floats, adjoint: Floats, whole_adjoint: Floats) -> None:
         demand, turned_over = self._demand(rate)
         deliverable = _deliverable(turned_over)
-        available_stock = stock.take(self._donors, axis=0)
         available = available_stock * deliverable * KEPT
         is_cut = demand > available
         if not is_cut.any():
@@ -64,7 +125,7 @@ class ScheduledFlows:
         ratio = np.divide(1.0, demand, out=np.zeros_like(demand), where=is_cut)
         factor_adjoint = self._sum(adjoint[self._arcs] * rate[self._arcs]) * ratio
         adjoint[self._arcs] *= np.where(is_cut, available * ratio, 1.0).take(self._slot, axis=0)
-        stock_adjoint[self._donors] += factor_adjoint * deliverable * KEPT
+        whole_adjoint += factor_adjoint * deliverable * KEPT
         # d/dT of T/(e^T − 1), T what is turned over
         grown = np.expm1(turned_over)
         slope = np.divide(1.0 - deliverable * (grown + 1.0), grown, out=np.full_like(grown, -0.5), where=grown > 1e-8)
@@ -72,6 +133,15 @@ class ScheduledFlows:
             [-factor_adjoint * available * ratio, factor_adjoint * available_stock * slope * KEPT]
         )
         self._outflows.transpose().add_to(adjoint, outflows * self._substep)
+
+    def _stocks(self, stock: Floats) -> Floats:
+        """Return what each donor holds, all components together, shape (donors, B)."""
+        available_stock = stock.take(self._donors, axis=0)
+        return (
+            available_stock
+            if self._others is None
+            else self._others.add_to(available_stock, stock[: self._others.shape[1]])
+        )
 
     def _demand(self, rate: Floats) -> tuple[Floats, Floats]:
         """Return what is asked of each donor by schedule, mass, and the part of its stock that it turns over."""

@@ -7,10 +7,27 @@ from typing import Any
 
 import numpy as np
 
+from cirl_marl.dynamics.components import ComponentNetwork
 from cirl_marl.dynamics.uncertain_factors import ControlFactors, RowFactors
 from cirl_marl.network import Floats, Integers, Network, RowSum
+from cirl_marl.network.elements import Law
 from cirl_marl.network.rowsum import single_column
 from cirl_marl.network.uncertainty import numbers_of
+
+
+def _numbers_of_shares(network: Network, ranges: Mapping[str, tuple[float, float]]) -> dict[int, int]:
+    """Return the rows of factors on shares, by arc; a substance has that of its transfer where one is stated."""
+    numbers = numbers_of(ranges, "arcs", "share")
+    of_arcs = {network.arc_index[id_]: number for id_, number in numbers.items()}
+    if not isinstance(network, ComponentNetwork):
+        return of_arcs
+    for substance in (substance.id for substance in network.substances):
+        own = numbers_of(ranges, "arcs", f"transfer.{substance}")
+        for original in network.arcs[: len(network.arcs) // (1 + len(network.substances))]:
+            stated = substance in dict(original.transfer)
+            if original.law is Law.SHARE and (number := (own if stated else numbers).get(original.id)) is not None:
+                of_arcs[network.arc_index[f"{original.id}.{substance}"]] = number
+    return of_arcs
 
 
 class Shares:
@@ -28,8 +45,7 @@ class Shares:
 
     def __init__(self, network: Network, ranges: Mapping[str, tuple[float, float]]) -> None:
         """Compile the splits of ``network``; those of which a share is in ``ranges``, of factors, vary."""
-        numbers = numbers_of(ranges, "arcs", "share")
-        number_of = {network.arc_index[id_]: number for id_, number in numbers.items()}
+        number_of = _numbers_of_shares(network, ranges)
         all_splits = network.splits
         tables = [(single_column(split.bounds), single_column(split.proportions)) for split in all_splits]
         self.is_time_varying = any(table.shape[-1] > 1 for pair in tables for table in pair)

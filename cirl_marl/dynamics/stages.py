@@ -117,11 +117,6 @@ def staged_network(network: Network, whole: Container[str] = ()) -> StagedNetwor
     )
 
 
-def simulated_network(network: Network) -> Network:
-    """Return the network whose motion the simulator follows: with lifetimes as chains and lines, if it has any."""
-    return staged_network(network) if any(node.lifetime is not None for node in network.stores) else network
-
-
 class _Parts:
     """What lifetimes are made of."""
 

@@ -12,12 +12,14 @@ from typing import Annotated
 
 import numpy as np
 
+from cirl_marl.dynamics.components import ComponentNetwork
 from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Law, Role
 from cirl_marl.network.rowsum import RowSum, spans
 from cirl_marl.network.series import extremes
+from cirl_marl.network.substances import REMAINDER
 
 
 @positional_record
@@ -49,7 +51,9 @@ class StateLayout:
 
     Attributes:
         nodes: rows of the stocks, those of nodes with a lifetime by stage.
-        stages: rows of the stages of each node with a lifetime, by the position of the node.
+        stages: rows of each node that has several, by the position of the node: of each component in turn the stages
+            of its lifetime, if it has one.
+        components: what is no substance, and the substances.
         batches: rows of the masses of batch arcs.
         unit: the unit row; the rows before it hold all the mass there is.
         masses: number of rows of the masses, the unit row included.
@@ -60,8 +64,9 @@ class StateLayout:
         owners: compartments with a model, in network order.
         states: rows of each owner's inner states.
         state_names: ``compartment.state`` of each inner state.
-        start_names: nodes with a stock, ``node.stage_i`` of those with a lifetime, then inner states: what an episode
-            starts from, and plans and snapshots are compared by.
+        start_names: nodes with a stock, ``node.stage_i`` of those with a lifetime, in a network with substances
+            followed by ``.remainder`` or ``.substance``, then inner states: what an episode starts from, and plans and
+            snapshots are compared by.
         outputs: row of each owner's output, past the unit row.
         donors: row of each arc's donor, the unit row for one that stores nothing, shape (arcs,).
     """
@@ -71,11 +76,16 @@ class StateLayout:
         nodes = len(network.stores)
         stages_of: Mapping[str, tuple[str, ...]] = {}
         self.stages: dict[int, Integers] = {}
+        self.components = 1
         if isinstance(network, StagedNetwork):
             stages_of = {node: stages for node, stages in network.stages.items() if len(stages) > 1}
             index = network.node_index
             self.stages = {index[node]: network.node_index_of(stages) for node, stages in stages_of.items()}
-        self._totals = _totals(nodes, self.stages) if stages_of else None
+            if isinstance(network, ComponentNetwork):
+                self.components = 1 + len(network.substances)
+                self.stages = self._rows_of_components(nodes // self.components)
+        self._totals = _totals(nodes, self.stages) if self.stages else None
+        self._substances = self._substance_sums(nodes)
         names: list[str] = []
         self.lines = tuple(
             _line(network, k, nodes, names) for k, arc in enumerate(network.arcs) if arc.law is Law.BATCH
@@ -90,7 +100,12 @@ class StateLayout:
         self.owners = tuple(models)
         self.state_names = tuple(f"{owner}.{name}" for owner, model in models.items() for name in model.state_names)
         last = {node: f"{node}.stage_{len(stages)}" for node, stages in stages_of.items()}
-        self.start_names = (*(last.get(node.id, node.id) for node in network.stores), *self.state_names)
+        stores = [last.get(node.id, node.id) for node in network.stores]
+        if isinstance(network, ComponentNetwork):
+            base = stores[: nodes // self.components]
+            components = (REMAINDER, *(substance.id for substance in network.substances))
+            stores = [f"{name}.{component}" for component in components for name in base]
+        self.start_names = (*stores, *self.state_names)
         self.states = dict(zip(models, spans(len(model.state_names) for model in models.values()), strict=True))
         self.outputs = {owner: self.masses + i for i, owner in enumerate(self.owners)}
         # a node without stock has no row: what is asked of its row is asked of the unit row, which is never short
@@ -100,10 +115,33 @@ class StateLayout:
         """Return the stock of each node that has one, shape (stores, B), of masses or of their first rows."""
         return masses[self.nodes] if self._totals is None else self._totals(masses[self.nodes])
 
-    def masses_adjoint(self, stocks_adjoint: Floats) -> Floats:
-        """Return derivatives by the masses, shape (masses, B), of those by the ``stocks``: all stages count alike."""
+    def substances(self, masses: Floats) -> Floats:
+        """Return the mass of each substance in each node with a stock, shape (substances · stores, B)."""
+        return self._substances(masses[self.nodes])
+
+    def _rows_of_components(self, stores: int) -> dict[int, Integers]:
+        """Return the rows of each node, of each of whose components there are so many ``stores``."""
+        singles = stores - sum(len(rows) - 1 for i, rows in self.stages.items() if i < stores)
+        first = stores * np.arange(self.components)[:, None]
+        return {i: (first + self.stages.get(i, np.array([i]))).ravel() for i in range(singles)}
+
+    def _substance_sums(self, rows: int) -> RowSum:
+        """Return the sums of the rows of each node, of one substance after the other."""
+        entries = [
+            (part * len(self.stages) + i, int(row))
+            for i, rows_ in enumerate(self.stages.values() if self.components > 1 else ())
+            for part, of_part in enumerate(np.split(rows_, self.components)[1:])
+            for row in of_part
+        ]
+        places, columns = np.array(entries, dtype=np.intp).reshape(-1, 2).T
+        return RowSum(places, columns, 1.0, ((self.components - 1) * len(self.stages), rows))
+
+    def masses_adjoint(self, stocks_adjoint: Floats, substances_adjoint: Floats | None = None) -> Floats:
+        """Return derivatives by the masses, shape (masses, B), of those by ``stocks`` and by ``substances``, if any."""
         masses = np.zeros((self.masses, stocks_adjoint.shape[1]))
         masses[self.nodes] = stocks_adjoint if self._totals is None else self._totals.transpose()(stocks_adjoint)
+        if substances_adjoint is not None:
+            self._substances.transpose().add_to(masses[self.nodes], substances_adjoint)
         return masses
 
     def start_of(self, masses: Floats, inner: Floats) -> Floats:

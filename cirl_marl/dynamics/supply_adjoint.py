@@ -31,13 +31,19 @@ class SupplyAdjoint:
         self._measured = supply.measure.transpose()
 
     def pull_back(
-        self, inputs: IntervalInputs, step: Integers, idle: Bools, stock_adjoint: Floats, moved_adjoint: Floats
+        self,
+        inputs: IntervalInputs,
+        step: Integers,
+        idle: Bools,
+        stock_adjoint: Floats,
+        moved_adjoint: Floats,
+        substances_adjoint: Floats | None = None,
     ) -> IntervalInputs:
         """Return what ``Adjoint.pull_back`` does, for controls that came with what ``idle`` arcs supply.
 
         By the controls of these the derivatives are 0: they follow from all else. A supply at a bound stays there.
         """
-        result = self._adjoint.pull_back(inputs, step, stock_adjoint, moved_adjoint)
+        result = self._adjoint.pull_back(inputs, step, stock_adjoint, moved_adjoint, substances_adjoint)
         if not idle.any():
             return result
         per_extent, transposed = self._extents(inputs, step, idle)

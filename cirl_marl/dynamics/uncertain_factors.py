@@ -10,6 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from cirl_marl.dynamics.components import ComponentNetwork
 from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import ControlKind, Law
@@ -122,7 +123,8 @@ class ControlFactors:
         table_rows = range(len(owner)) if rows is None else rows.tolist()
         numbers = {place: number_of[owner[row]] for place, row in enumerate(table_rows) if owner[row] in number_of}
         controls = {place: network.compartments[owner[row]].control for place, row in enumerate(table_rows)}
-        is_share = [place for place in numbers if (c := controls[place]) and c.kind is ControlKind.SHARE]
+        shares = (ControlKind.SHARE, ControlKind.TRANSFER)
+        is_share = [place for place in numbers if (c := controls[place]) and c.kind in shares]
         self._factors, self._shares = RowFactors(numbers), np.array(is_share, dtype=np.intp)
         self._ends = np.array([*ranges.values()], dtype=float).reshape(-1, 2).T
 
@@ -168,13 +170,14 @@ class FlowFactors:
         rates, flows = numbers_of(ranges, "arcs", "rate"), numbers_of(ranges, "arcs", "flow")
         releases, stretches = numbers_of(ranges, "nodes", "rate"), numbers_of(ranges, "nodes", "stretch")
         entries: list[tuple[int, int, bool]] = []
+        originals = network.originals if isinstance(network, ComponentNetwork) else {}
         for k, arc in enumerate(network.arcs):
             if arc.donor in valves:
                 number = stretches.get(valves[arc.donor])
             elif arc.law is Law.SHARE:
-                number = releases.get(arc.donor)
+                number = releases.get(originals.get(arc.donor, arc.donor))
             else:
-                number = (flows if arc.law is Law.EXOGENOUS else rates).get(arc.id)
+                number = (flows if arc.law is Law.EXOGENOUS else rates).get(originals.get(arc.id, arc.id))
             if number is not None:
                 entries.append((k, number, arc.donor in valves))
         self.arcs: Integers = np.array([k for k, _, _ in entries], dtype=np.intp)

@@ -76,13 +76,13 @@ class Derivatives:
         network, signals, step = env.network, env.layout.signals, before.step
         factors = env.dynamics.factors(before.factors, before.disturbances, step)
         factor_adjoint = None if factors is None else np.zeros_like(factors)
-        levels, by_seen = adjoint.levels, None
+        levels, by_seen, quantities = adjoint.levels, None, env.quantities(after)
         if adjoint.observation is not None:
-            by_seen, by_level, by_sight = env.layout.pull_back(adjoint.observation)
+            by_seen, by_level, by_sight = env.layout.pull_back(quantities, adjoint.observation)
             levels = levels + by_level
             if env.layout.sights:
                 env.layout.sights.pull_back(after.step, by_sight, path_adjoint)
-        by_quantity = env.scoring.pull_back(env.quantities(after), step, factors, levels, factor_adjoint)
+        by_quantity = env.scoring.pull_back(quantities, step, factors, levels, factor_adjoint)
         if by_seen is not None:
             by_quantity += by_seen
         by_flow = by_quantity[signals.flows] + network.circularity_adjoint(after.flow) * adjoint.circularity
@@ -94,10 +94,12 @@ class Derivatives:
             by_flow += bookings[0]
             by_start = bookings[1] / 2
             by_stock = by_stock + by_start
-        stock = adjoint.stock + env.rows.masses_adjoint(by_stock)
+        by_content = env.substances_adjoint(by_quantity[signals.substances]) if network.substances else (None, None)
+        stock = adjoint.stock + env.rows.masses_adjoint(by_stock, by_content[0])
         inputs = IntervalInputs(before.stock, interval.controls, factors)
-        moved = by_flow / network.episode.control_interval
-        result = self._supply.pull_back(inputs, step, env.idle, stock, moved)
+        length = network.episode.control_interval
+        moved, substances = by_flow / length, None if by_content[1] is None else by_content[1] / length
+        result = self._supply.pull_back(inputs, step, env.idle, stock, moved, substances)
         actions, ends = env.actuators.pull_back(interval.actions, step, factors, result.controls)
         draws = np.zeros_like(before.factors)
         if factors is not None and factor_adjoint is not None and result.factors is not None:

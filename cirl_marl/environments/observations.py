@@ -21,12 +21,14 @@ from cirl_marl.network.rowsum import RowSum, spans
 class Signals:
     """Rows of the signal table: quantities, time, service levels, set-points of nodes and arcs, disturbances.
 
-    The quantities are stocks, throughputs of nodes without stock, flows, inner states, measures and masses on the way
-    along batch arcs. All but inner states and measures, and the set-points, are divided by the scale of their
-    compartment (what a batch arc delivers in a control interval too), time by the horizon.
+    The quantities are stocks, throughputs of nodes without stock, flows, inner states, measures, masses on the way
+    along batch arcs, and of each substance the mass in stocks, throughputs and flows. All but inner states and
+    measures, and the set-points, are divided by the scale of their compartment (what a batch arc delivers in a control
+    interval too), time by the horizon. Of substances the contents are seen, divided by the scale of the substance.
 
     Attributes:
         quantities: number of quantities.
+        contents: rows of each substance, in nodes and in flows.
         time: row of the time.
         rows: number of rows.
         sights: what disturbances show, the last rows.
@@ -36,13 +38,18 @@ class Signals:
         """Lay out the signals of a network."""
         network, inner, nodes = dynamics.network, dynamics.inner, len(dynamics.network.nodes)
         arcs, lines, services = len(network.arcs), len(dynamics.batches.lines), len(network.services)
-        parts = spans((nodes, arcs, len(inner.names), len(inner.measure_names), lines, 1, services, nodes + arcs))
-        self.nodes, self.flows, self.states, self.measures, self.loads, time, self.levels, self.set_points = parts
+        places = nodes + arcs
+        counts = (nodes, arcs, len(inner.names), len(inner.measure_names), lines, len(network.substances) * places)
+        parts = spans((*counts, 1, services, places))
+        self.nodes, self.flows, self.states, self.measures, self.loads, self.substances, *rest = parts
+        time, self.levels, self.set_points = rest
+        firsts = range(self.substances.start, self.substances.stop, places)
+        self.contents = [range(first, first + places) for first in firsts]
         self.stocks, self.throughputs = slice(0, len(network.stores)), slice(len(network.stores), nodes)
         self.sights = Sights(network.processes)
         self.seen = slice(self.set_points.stop, self.set_points.stop + len(self.sights.names))
-        self.quantities, self.time, self.rows = self.loads.stop, time.start, self.seen.stop
-        self.inside = self.quantities > self.flows.stop  # whether there are quantities besides stocks and flows
+        self.quantities, self.time, self.rows = self.substances.stop, time.start, self.seen.stop
+        self.inside = self.loads.stop > self.flows.stop  # whether there are quantities inside compartments
 
 
 class Sights:
@@ -169,6 +176,8 @@ class ObservationLayout:
         scales = np.array([c.scale for c in network.compartments.values()])
         inside = np.ones(signals.loads.start - signals.states.start)
         inverse_scale = 1.0 / np.concatenate([scales, inside, scales[signals.flows][batches.arcs]])
+        of_substances = [1.0 / substance.scale for substance in network.substances]
+        inverse_scale = np.concatenate([inverse_scale, np.repeat(of_substances, len(scales))])
         inverse_scale[signals.flows][batches.arcs] *= network.episode.control_interval
         # equal shapes are faster than a broadcast
         self._inverse_scale = np.repeat(inverse_scale[:, None], batch, axis=1)
@@ -193,6 +202,8 @@ class ObservationLayout:
         by way of a ``table`` of single precision, or of one like it of another.
         """
         table = self._table if table is None else table
+        if self.signals.contents:
+            quantities = self._with_contents(quantities)
         with np.errstate(over="ignore"):
             np.multiply(quantities, self._inverse_scale, out=table[: self.signals.quantities], casting="same_kind")
         table[self.signals.time] = time
@@ -202,15 +213,30 @@ class ObservationLayout:
         observation: NDArray[Any] = table.take(self._index, axis=0)
         return observation
 
+    def _with_contents(self, quantities: Floats) -> Floats:
+        """Return quantities with contents in place of masses of substances; they are 0 where there is nothing."""
+        quantities = quantities.copy()
+        whole = quantities[: self.signals.flows.stop]
+        for mass in (quantities[_slice(rows)] for rows in self.signals.contents):
+            mass[...] = np.divide(mass, whole, out=np.zeros_like(mass), where=whole > 0)
+        return quantities
+
     def double_table(self) -> Floats:
         """Return a table for ``observe`` of double precision."""
         return self._table.astype(np.float64)
 
-    def pull_back(self, adjoint: Floats) -> tuple[Floats, Floats, Floats]:
+    def pull_back(self, quantities: Floats, adjoint: Floats) -> tuple[Floats, Floats, Floats]:
         """Return derivatives by quantities, levels and sights of those by the observation, shape (entries, B)."""
         signals, by_signal = self.signals, self._signal_sum(adjoint)
-        quantities = by_signal[: signals.quantities] * self._inverse_scale
-        return quantities, by_signal[signals.levels], by_signal[signals.seen]
+        by_quantity = by_signal[: signals.quantities] * self._inverse_scale
+        places = slice(0, signals.flows.stop)
+        per_whole = np.divide(
+            1.0, quantities[places], out=np.zeros_like(quantities[places]), where=quantities[places] > 0
+        )
+        for rows in map(_slice, signals.contents):
+            by_quantity[rows] *= per_whole
+            by_quantity[places] -= by_quantity[rows] * quantities[rows] * per_whole
+        return by_quantity, by_signal[signals.levels], by_signal[signals.seen]
 
     def _common_order(self, agents: Sequence[str], mode: str) -> tuple[str, ...]:
         if mode == "stocks":
@@ -245,6 +271,7 @@ class ObservationLayout:
             ends = filter(None, (compartment.donor, compartment.recipient, compartment.capacity_node))
             near = [network.node_index[end] for end in ends]
             yield from near
+        yield from (rows[place] for rows in signals.contents for place in dict.fromkeys((position, *near)))
         arcs = [] if is_arc and mode != "neighbours" else [k for node in near for k in self._incident[node]]
         yield from (signals.flows.start + k for k in arcs)
         yield from (self._load[network.arcs[k].id] for k in arcs if network.arcs[k].id in self._load)
@@ -273,6 +300,7 @@ class ObservationLayout:
         yield from (f"flow of {arc.id}" for arc in network.arcs)
         yield from states
         yield from (f"mass on {arc}" for arc in self._load)
+        yield from (f"{part.id} in {id_}" for part in network.substances for id_ in network.compartments)
         yield "time"
         yield from (f"service level of {service.id}" for service in network.services)
         yield from (f"set-point of {id_}" for id_ in network.compartments)
@@ -297,16 +325,23 @@ class ObservationLayout:
             routing = dynamics.routing
             through = routing.most(flows)
             flows[routing.arcs] = through.take(routing.donors) * dynamics.max_rate[routing.arcs]
+            # of each component as much may flow as all of its copies can carry
+            flows = flows.reshape(dynamics.rows.components, -1).max(axis=0)
             stores = signals.throughputs.start
             through, flows = through[: len(network.nodes) - stores], flows[: len(network.arcs)]
             limits = np.concatenate([np.full(stores, mass), through, flows]) / scales
             low[mass_rows], high[mass_rows] = 0.0, limits * (1 + 1e-6) + 1e-6
         low[mass_rows.stop : signals.quantities], high[mass_rows.stop : signals.quantities] = -np.inf, np.inf
-        low[signals.loads] = 0.0
+        low[signals.loads] = low[signals.substances] = 0.0
+        high[signals.substances] = self._inverse_scale[signals.substances, 0] * (1 + 1e-6)
         set_points = np.abs([c.set_point or 0.0 for c in compartments]) / scales
         low[signals.set_points], high[signals.set_points] = -set_points - 1, set_points + 1
         low[signals.seen], high[signals.seen] = self.sights.low[:, 0] - 1e-6, self.sights.high[:, 0] + 1e-6
         return low.astype(np.float32), high.astype(np.float32)
+
+
+def _slice(rows: range) -> slice:
+    return slice(rows.start, rows.stop)
 
 
 def _incident_arcs(network: Network) -> list[list[int]]:

@@ -14,6 +14,7 @@ from cirl_marl.environments.observations import ObservationLayout
 from cirl_marl.environments.state import State
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.elements import Service
 from cirl_marl.network.rowsum import RowSum
 from cirl_marl.network.series import Series
 from cirl_marl.network.uncertainty import numbers_of
@@ -33,7 +34,8 @@ class Scoring:
         r_c = −((q − set_point)/scale)² − Σ_s weight_s · shortfall_s,    s over the services that c owes
 
     plus the reward of its model, if it has one. Here shortfall = 1 − level, and the level of a service with band
-    [low, high] is min(1, q/low, high/q), without q/low if low = 0.
+    [low, high] is min(1, q/low, high/q), without q/low if low = 0. Of a service with a substance q is the content of
+    what it measures, and the level is 1 where there is nothing.
 
     Args of all methods are compartment-major, shape (rows, B).
 
@@ -54,7 +56,10 @@ class Scoring:
         self._inverse_scale = np.repeat(inverse_scale[:, None], batch, axis=1)
         services = network.services
         self.service_factors: Floats = np.ones(len(services))
-        self._measure = _measurement(network, layout)
+        self._measured = _measurement(network, services, layout)
+        self._contents = np.flatnonzero([bool(service.substance) for service in services])
+        wholes = [replace(services[s], substance="") for s in self._contents.tolist()]
+        self._wholes = _measurement(network, wholes, layout)
         self._vary_in_time = any(isinstance(band, Series) for s in services for band in (s.low, s.high))
         width = network.episode.horizon if self._vary_in_time else 1
         bands = [[network.interval_means(getattr(s, end))[:width] for s in services] for end in ("low", "high")]
@@ -101,6 +106,8 @@ class Scoring:
         """
         quantity, (low, high) = self._measure(quantities), self._bands(step, factors)
         level: Floats = np.divide(quantity, low, out=np.ones_like(quantity), where=low > 0)
+        if len(self._contents):
+            level[self._contents] = np.where(self._wholes(quantities) > 0, level[self._contents], 1.0)
         if self._has_high:
             np.divide(high, quantity, out=level, where=quantity > high)
         np.minimum(level, 1.0, out=level)
@@ -129,7 +136,23 @@ class Scoring:
             parts = np.divide(-per_low * quantity, low, out=np.zeros_like(quantity), where=is_below), per_quantity
             for scale, table, part in zip(self._factors, tables, parts, strict=True):
                 scale.pull_back(np.where(np.isfinite(table), table, 0.0), part, factor_adjoint)
-        return self._measure.transpose()(per_low - per_quantity * over)
+        by_measure = per_low - per_quantity * over
+        if not len(self._contents):
+            return self._measured.transpose()(by_measure)
+        whole = self._wholes(quantities)
+        by_part = np.divide(by_measure[self._contents], whole, out=np.zeros_like(whole), where=whole > 0)
+        by_whole = -by_part * quantity[self._contents]
+        by_measure[self._contents] = by_part
+        by_quantity = self._measured.transpose()(by_measure)
+        return self._wholes.transpose().add_to(by_quantity, by_whole)
+
+    def _measure(self, quantities: Floats) -> Floats:
+        """Return what each service measures, shape (services, B); a content is 0 where there is nothing."""
+        quantity = self._measured(quantities)
+        if len(self._contents):
+            part, whole = quantity[self._contents], self._wholes(quantities)
+            quantity[self._contents] = np.divide(part, whole, out=np.zeros_like(part), where=whole > 0)
+        return quantity
 
     def _bands(self, step: Integers, factors: Floats | None) -> tuple[Floats, Floats]:
         low, high = self._low, self._high
@@ -177,17 +200,20 @@ class Scoring:
         return total
 
 
-def _measurement(network: Network, layout: ObservationLayout) -> RowSum:
-    """Matrix that reads each service off the quantities, shape (services, quantities)."""
-    rows, columns = [], []
-    for row, service in enumerate(network.services):
+def _measurement(network: Network, services: Sequence[Service], layout: ObservationLayout) -> RowSum:
+    """Matrix that reads services off the quantities, with a substance its mass, shape (services, quantities)."""
+    rows, columns, signals = [], [], layout.signals
+    substances = {substance.id: part for substance, part in zip(network.substances, signals.contents, strict=True)}
+    for row, service in enumerate(services):
         if service.quantity == "outflow":
-            quantities = [layout.signals.flows.start + int(k) for k in network.service_arcs(service)]
+            quantities = [signals.flows.start + int(k) for k in network.service_arcs(service)]
         else:
             quantities = [layout.row(c, service.quantity, service.measure) for c in service.providers]
+        if service.substance:
+            quantities = [substances[service.substance][place] for place in quantities]
         rows += [row] * len(quantities)
         columns += quantities
-    return RowSum(rows, columns, 1.0, (len(network.services), layout.signals.quantities))
+    return RowSum(rows, columns, 1.0, (len(services), signals.quantities))
 
 
 class Credit:

@@ -13,7 +13,7 @@ from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.errors import ControlError, unknown_name
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.compartment_model import DiscreteTimeModel, GoalTask
-from cirl_marl.network.initial_ages import age_shares
+from cirl_marl.network.initial_ages import start_shares
 from cirl_marl.network.processes import Paths, disturbance_stream
 
 
@@ -39,10 +39,11 @@ class Starts:
         self.disturbance_streams = self._disturbance_streams([None] * num_envs)
         self._network, self._bounds, self._wholes = network, _bounds(network), _wholes(network)
         self._rows = {name: np.array([row]) for row, name in enumerate(self.names)}
-        self._stages = {network.stores[i].id: stages for i, stages in rows.stages.items()}
+        ids = {i: network.stores[i].id for i in rows.stages}
+        self._stages = {id_: rows.stages[i] for i, id_ in ids.items()}
         self._rows |= self._stages
         interval = network.episode.control_interval
-        self._spread = {id_: age_shares(network.stores[network.node_index[id_]], interval) for id_ in self._stages}
+        self._spread = {id_: start_shares(network, network.stores[i], interval) for i, id_ in ids.items()}
         inseparable = {name for names in self._wholes.values() for name in names}
         self._array_order = () if inseparable & set(order) else tuple(order)
         self._physical, self._stocks, self._inner = dynamics.physical, rows.nodes.stop, inner

@@ -30,6 +30,9 @@ class State:
     circularity: Annotated[Floats, "sum over the episode of the interval means of λ, shape (B,), mass"]
     service: Annotated[Floats, "sum over the episode of the level of each service, shape (services, B)"]
     accounts: Annotated[Floats, "amounts booked in this episode, discounted, shape (accounts, B)"]
+    substances: Annotated[
+        Floats, "mean flow of each substance in the last interval, shape (substances · arcs, B), mass/time"
+    ]
     processes: Annotated[
         Floats, "states of the disturbances in all intervals of the episode and the one after, (intervals, names, B)"
     ] = field(default_factory=no_paths)

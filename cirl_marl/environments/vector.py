@@ -326,6 +326,7 @@ class MultiAgentVectorEnv:
         ``cost_SERVICE``       shortfall 1 − level of each service, shape (B,)
         ``cost``               sum of the shortfalls, shape (B,): what safe reinforcement learning keeps below a budget
         ``accounts``           amount booked on each account in the interval, a dict account → shape (B,), if any
+        ``substances``         mean flows of each substance, a dict substance → (B, arcs), mass/time, if there are any
         ``drawn``              with ``uncertain``: factors in the order of ``network.uncertain``, shape (B, numbers)
         ``disturbances``       their values in the interval, a dict disturbance → shape (B,), if there are any
         ``year``               calendar year at the end, shape (B,), if the network begins in one
@@ -350,6 +351,11 @@ class MultiAgentVectorEnv:
         if self.ledger.accounts:
             outcome.bookings.setflags(write=False)
             info["accounts"] = dict(zip(self.ledger.accounts, outcome.bookings, strict=True))
+        if self.network.substances:
+            flows = self.physical.substances.reshape(len(self.network.substances), -1, self.num_envs)
+            flows.flags.writeable = False
+            names = (substance.id for substance in self.network.substances)
+            info["substances"] = {name: flow.T for name, flow in zip(names, flows, strict=True)}
         info |= self.drawn_info(np.maximum(self.physical.step - 1, 0))
         if (year := self.year) is not None:
             year.flags.writeable = False
@@ -437,7 +443,8 @@ class MultiAgentVectorEnv:
             accounts = accounts + bookings * self.ledger.discount.take(state.step, axis=1)
         amounts = accounts - state.accounts
         reward = self._credit.pay(circularity, mean, local, terms, levels, state, controls, amounts)
-        totals = (state.circularity + mean, state.service + levels, accounts)
+        substances = transition.moved_substances / self.network.episode.control_interval
+        totals = (state.circularity + mean, state.service + levels, accounts, substances)
         measures = quantities[self.layout.signals.measures]
         drawn = (state.processes, state.disturbances)
         self._state = State(
@@ -549,10 +556,11 @@ class MultiAgentVectorEnv:
         scales = dynamics.factors(factors, paths.values, step)
         idle = np.ones((len(self.supply.arcs), 1), dtype=bool)
         neutral = self.supply(stock, inner, dynamics.neutral_in(step, scales), step, idle, scales)
-        flow, measures = dynamics.start_flow(stock, inner, neutral, scales), dynamics.inner.measures(inner, neutral)
+        flow, substances = dynamics.start_flow(stock, inner, neutral, scales)
+        measures = dynamics.inner.measures(inner, neutral)
         batched, circularity = np.zeros((2, batch)), np.zeros(batch)
         service, accounts = (np.zeros((len(part), batch)) for part in (self.network.services, self.network.accounts))
-        sums = (batched, circularity, service, accounts)
+        sums = (batched, circularity, service, accounts, substances)
         return State(stock, inner, flow, measures, step, factors, *sums, paths.states, paths.values)
 
     def _measure(self, transition: Transition, controls: Floats) -> tuple[Floats, Floats]:
@@ -568,6 +576,10 @@ class MultiAgentVectorEnv:
             quantities[signals.states] = transition.inner
             quantities[signals.measures] = dynamics.inner.measures(transition.inner, controls)
             quantities[signals.loads] = dynamics.batches.loads(transition.stock)
+        if self.network.substances:
+            quantities[signals.substances] = self._substances(
+                transition.stock, transition.moved_substances / self.network.episode.control_interval
+            )
         flow.flags.writeable = False  # infos hand it out, and the state keeps it
         return quantities, flow
 
@@ -575,7 +587,28 @@ class MultiAgentVectorEnv:
         """Return the quantities of a state, in the rows of ``layout.signals``, shape (quantities, B)."""
         loads = self.dynamics.batches.loads(state.stock)
         through = self.network.throughput(state.flow)
-        return np.concatenate([self.rows.stocks(state.stock), through, state.flow, state.inner, state.measures, loads])
+        parts = [self.rows.stocks(state.stock), through, state.flow, state.inner, state.measures, loads]
+        if self.network.substances:
+            parts.append(self._substances(state.stock, state.substances))
+        return np.concatenate(parts)
+
+    def _substances(self, masses: Floats, flow: Floats) -> Floats:
+        """Return the mass of each substance in stocks, throughputs and flows, in the rows of ``signals.substances``."""
+        batch, count = masses.shape[1], len(self.network.substances)
+        stocks, flows = (part.reshape(count, -1, batch) for part in (self.rows.substances(masses), flow))
+        through = self.network.throughput(np.moveaxis(flows, 0, 1)).swapaxes(0, 1)
+        return np.concatenate([stocks, through, flows], axis=1).reshape(-1, batch)
+
+    def substances_adjoint(self, adjoint: Floats) -> tuple[Floats, Floats]:
+        """Return derivatives by the masses of substances in stocks and by their flows of those by the quantities.
+
+        Shapes are (substances · stores, B) and (substances · arcs, B); of what is given (rows of
+        ``signals.substances``, B).
+        """
+        batch, stores, nodes = adjoint.shape[1], len(self.network.stores), len(self.network.nodes)
+        parts = adjoint.reshape(len(self.network.substances), -1, batch)
+        flows = [self.network.throughput_adjoint(part[stores:nodes]) + part[nodes:] for part in parts]
+        return parts[:, :stores].reshape(-1, batch), np.concatenate(flows)
 
     def observe_into(self, table: Floats) -> Floats:
         """Return the stacked observation by way of ``table``, of its precision (``ObservationLayout.observe``)."""

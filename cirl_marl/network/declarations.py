@@ -15,6 +15,7 @@ from dataclasses import KW_ONLY, MISSING, dataclass, fields
 from datetime import date, datetime
 from enum import StrEnum
 from functools import cache, partial
+from itertools import chain
 from numbers import Integral, Real
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, dataclass_transform, get_type_hints
@@ -91,11 +92,15 @@ class Word(Declaration):
 
 
 class Kinds(NamedTuple):
-    """A kind of quantity that depends on the value of the field ``by``: one ``of`` those named, or ``otherwise``."""
+    """A kind of quantity that depends on the value of the field ``by``: one ``of`` those named, or ``otherwise``.
+
+    It is a part, of kind ``1``, where a field ``content_of`` says of what.
+    """
 
     by: str
     of: Mapping[str | bool, Kind]
     otherwise: Kind
+    content_of: str = ""
 
 
 SMALLEST, LARGEST = 1e-50, 1e50
@@ -119,7 +124,11 @@ class Quantity(Declaration):
     def kind(self, part: object) -> Kind:
         """Return the kind of quantity in ``part``, a part of a network or its table in a definition file."""
         kinds = self.of
-        return kinds if isinstance(kinds, str) else kinds.of.get(getattr(part, kinds.by), kinds.otherwise)
+        if isinstance(kinds, str):
+            return kinds
+        if kinds.content_of and getattr(part, kinds.content_of):
+            return "1"
+        return kinds.of.get(getattr(part, kinds.by), kinds.otherwise)
 
     def problem(self, value: object) -> str:
         """See ``Declaration.problem``."""
@@ -167,21 +176,20 @@ class Numbers(Declaration):
 
 @positional_record
 class Rates(Declaration):
-    """Numbers that may change in time, one for each of some accounts, in the unit of the account per ``per``."""
+    """Numbers by name: one for each of some accounts, in the unit of the account per ``per``, or of some substances."""
 
     per: Annotated[str, "what an amount is charged for: ``mass``, or ``stock``, which is mass · time"] = "mass"
+    of: Annotated[Literal["account", "substance"], "what has the names"] = "account"
+    number: Annotated[Quantity, "what each of them is"] = RATE
 
     def problem(self, value: object) -> str:
         """See ``Declaration.problem``."""
         pairs = value if isinstance(value, tuple) else ()
         if not isinstance(value, tuple) or not all(isinstance(pair, tuple) and len(pair) == 2 for pair in pairs):
-            return f"{{account: number, …}}, got {value!r}"
-        faults = [f"{name!r}: a number, got {rate!r}" for name, rate in pairs if not _is_rate(rate)]
-        return next(iter(faults), "")
-
-
-def _is_rate(value: object) -> bool:
-    return isinstance(value, TimeDependent) or (_fits(value, ()) and not isinstance(value, bool))
+            return f"{{{self.of}: number, …}}, got {value!r}"
+        truths = (f"{name!r}: a number, got {number!r}" for name, number in pairs if isinstance(number, bool))
+        faults = (f"{name!r}: {fault}" for name, number in pairs if (fault := self.number.problem(number)))
+        return next(chain(truths, faults), "")
 
 
 Amount = partial(Numbers, form="a number", shape=(), table_form="amount", varies=True)
@@ -293,10 +301,10 @@ def bound_problems(part_: Any, prefix: str = "") -> Iterator[str]:
 
 
 def numbers(part_: Any) -> Iterator[tuple[str, Declaration, Any]]:
-    """Give name, declaration and value of every declared field; of rates of accounts each, as ``accounts.NAME``."""
+    """Give name, declaration and value of every declared field; of rates each, as ``accounts.NAME``."""
     for name, declaration in declarations(type(part_)).items():
         if isinstance(declaration, Rates):
-            yield from ((f"{name}.{account}", RATE, rate) for account, rate in getattr(part_, name))
+            yield from ((f"{name}.{id_}", declaration.number, number) for id_, number in getattr(part_, name))
         else:
             yield name, declaration, getattr(part_, name)
 

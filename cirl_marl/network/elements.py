@@ -59,13 +59,15 @@ class ControlKind(StrEnum):
     """What an agent sets.
 
     A factor on flows (``rate``, a valve), the flow itself (``flow``), a share of what leaves the donor (``share``), a
-    factor on the lifetime of all that is in use (``stretch``) or an input of the model (``input``).
+    factor on the lifetime of all that is in use (``stretch``), the share of some substances in what leaves the donor
+    (``transfer``) or an input of the model (``input``).
     """
 
     RATE = "rate"
     FLOW = "flow"
     SHARE = "share"
     STRETCH = "stretch"
+    TRANSFER = "transfer"
     INPUT = "input"
 
 
@@ -96,11 +98,11 @@ LAW_FIELDS: Mapping[Law, tuple[str, ...]] = {
 RATE_OF = Kinds("law", {Law.COMPARTMENT: "flow", Law.BATCH: "mass"}, "rate")
 SCALE_OF = Kinds("law", {Law.BATCH: "mass"}, "flow")
 LEVEL_OF = Kinds("stores", {False: "flow"}, "mass")
-BAND_OF = Kinds("quantity", {"stock": "mass", "measure": "1"}, "flow")
+BAND_OF = Kinds("quantity", {"stock": "mass", "measure": "1"}, "flow", content_of="substance")
 
 Pair = tuple[float, float]
-AccountRates = Mapping[str, Value] | tuple[tuple[str, Value], ...]
-"""Rates by account; parts keep them as pairs, which can be hashed."""
+NamedValues = Mapping[str, Value] | tuple[tuple[str, Value], ...]
+"""Numbers by account or substance; parts keep them as pairs, which can be hashed."""
 
 
 @frozen_record
@@ -111,13 +113,16 @@ class Control(CheckedRecord):
         ControlKind,
         Word(
             "``rate``, a factor on flows; ``flow``, mass/time; ``share``, of what leaves the donor; ``stretch``, a "
-            "factor on the node's lifetime; or ``input``, of a model",
+            "factor on the node's lifetime; ``transfer``, the share of ``substances``; or ``input``, of a model",
             of=ControlKind,
         ),
     ]
     low: Annotated[Value, Amount("value at action −1, of each entry of the action")]
     neutral: Annotated[Value, Amount("value while nobody acts on the compartment")]
     high: Annotated[Value, Amount("value at action +1, of each entry of the action")]
+    substances: Annotated[
+        tuple[str, ...], Declaration("of which kind ``transfer`` sets the share; all else has the ``share`` of the arc")
+    ] = ()
 
     @property
     def nominal(self) -> Value:
@@ -188,6 +193,7 @@ class FeedbackRule(CheckedRecord):
     ] = ()
 
 
+CONTENT = Quantity("a part of the mass", low=0.0, high=1.0)
 RATES = Rates(
     "amounts by account, per mass that flows along an arc or enters a node; negative ones are revenues or credits"
 )
@@ -217,7 +223,7 @@ class Compartment(CheckedRecord):
     control: Annotated[Control | None, CONTROL] = None
     rule: Annotated[FeedbackRule | None, RULE] = None
     model: Annotated[CompartmentModel | None, MODEL] = None
-    accounts: Annotated[AccountRates, RATES] = ()
+    accounts: Annotated[NamedValues, RATES] = ()
     inner: Annotated[tuple[Pair, ...], INNER] = ()
     reward_scale: Annotated[float, Positive("the model's reward is divided by it")] = 1.0
 
@@ -293,7 +299,11 @@ class Node(Compartment):
             of="rate",
         ),
     ] = None
-    holding: Annotated[AccountRates, Rates("amounts by account, per mass that is held and time", per="stock")] = ()
+    holding: Annotated[NamedValues, Rates("amounts by account, per mass that is held and time", per="stock")] = ()
+    content: Annotated[
+        NamedValues,
+        Rates("part of each substance in the initial stock, and in the history", of="substance", number=CONTENT),
+    ] = ()
     set_point: Annotated[
         float | None, Quantity("stock aimed at, mass, or throughput, mass/time; None if there is none", of=LEVEL_OF)
     ] = None
@@ -338,6 +348,15 @@ class Arc(Compartment):
             none_word="rest",
         ),
     ] = None
+    transfer: Annotated[
+        NamedValues,
+        Rates(
+            "shares of substances that differ from s, where the donor separates them; the arc that takes the rest, "
+            "takes that of each substance",
+            of="substance",
+            number=Share("a share", varies=True),
+        ),
+    ] = ()
     by: Annotated[
         str, Declaration("compartment whose model gives the flow (compartment law) or releases the batches (batch law)")
     ] = ""
@@ -402,7 +421,8 @@ class Service(CheckedRecord):
     """What the network is there for: a stock or flow to be kept within a band, under an ``id`` of its own.
 
     The level is 1 inside ``[low, high]``, ``q/low`` below it and ``high/q`` above it; the shortfall is 1 - level. A
-    band from 0 only bounds what piles up.
+    band from 0 only bounds what piles up. With a ``substance`` q is its content in the stocks or flows, and the level
+    is 1 where there is nothing.
     """
 
     id: str
@@ -428,6 +448,10 @@ class Service(CheckedRecord):
     )
     weight: Annotated[float, NotNegative("factor of the shortfall in the local rewards", mandatory=True)] = 1.0
     measure: Annotated[str, Declaration('name of the measure, for ``quantity = "measure"``')] = ""
+    substance: Annotated[
+        str,
+        Declaration("whose content in the stocks or flows, a part of their mass, is to lie in the band; then 0 to 1"),
+    ] = ""
     owed_by: Annotated[
         tuple[str, ...],
         Declaration("compartments whose local reward bears the shortfall; empty means the provider alone"),
@@ -472,6 +496,20 @@ class Account(CheckedRecord):
         ),
     ]
     discount: Annotated[float, Quantity("r, by which a year later counts less", low=-0.99, high=10.0)] = 0.0
+
+
+@frozen_record
+class Substance(CheckedRecord):
+    """What is in the material, such as copper in steel, under an ``id`` of its own.
+
+    Of a stock x it is a part x_e, and what is no substance is one too, x − Σ x_e. Each flows in the same proportion
+    as the stock that it is in, but where a node separates them (``transfer``); what flows by schedule has the content
+    of its donor at the start of a step of the solver, and a node without stock mixes what enters it.
+    """
+
+    id: str
+    title: Annotated[str, TITLE] = ""
+    scale: Annotated[float, Positive("reference content of observations, a part of the mass")] = 1.0
 
 
 @frozen_record

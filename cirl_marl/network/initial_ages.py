@@ -11,6 +11,8 @@ from cirl_marl.network.elements import Lifetime, Node
 from cirl_marl.network.lifetimes import Chain
 from cirl_marl.network.rowsum import Floats
 from cirl_marl.network.series import Series
+from cirl_marl.network.specification import Specification
+from cirl_marl.network.substances import contents
 
 STEEPEST = 100.0
 """Most by which the logarithm of what enters may grow in a lifetime."""
@@ -71,6 +73,12 @@ def age_shares(node: Node, interval: float) -> Floats:
     else:
         parts = np.append(np.exp(-growth * interval * np.arange(slots(lifetime, interval))), 0.0)
     return np.asarray(parts / parts.sum())
+
+
+def start_shares(network: Specification, node: Node, interval: float) -> Floats:
+    """Return the part of a node's initial stock that is in each of its rows: by component, and in each by age."""
+    ages = np.ones(1) if node.lifetime is None else age_shares(node, interval)
+    return np.asarray(np.kron(contents(network, node), ages)) if network.substances else ages
 
 
 @lru_cache(maxsize=256)  # commodities and scenarios share lifetimes, and a matrix exponential takes milliseconds

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from cirl_marl.network.elements import Account, Arc, Episode, Node, Objective, Observation, Service
+from cirl_marl.network.elements import Account, Arc, Episode, Node, Objective, Observation, Service, Substance
 from cirl_marl.network.rowsum import Floats
 from cirl_marl.network.series import Series, Value
 
@@ -26,6 +26,7 @@ class Specification:
         arcs: compartments with a flow, in the order of every flow array.
         services: what the network owes its users.
         accounts: what is counted beside mass: money, emissions, energy.
+        substances: what the material has in it, beside all else.
         episode: time and solver.
         objective: circularity and rewards.
         observation: default observation.
@@ -53,6 +54,7 @@ class Specification:
     arcs: tuple[Arc, ...]
     services: tuple[Service, ...] = ()
     accounts: tuple[Account, ...] = ()
+    substances: tuple[Substance, ...] = ()
     episode: Episode = field(default_factory=Episode)
     objective: Objective = field(default_factory=Objective)
     observation: Observation = field(default_factory=Observation)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cirl_marl.network.declarations import with_field_docs
-from cirl_marl.network.elements import Law
+from cirl_marl.network.elements import ControlKind, Law
 from cirl_marl.network.rowsum import Floats, Integers, single_column
 from cirl_marl.network.series import Series
 from cirl_marl.network.specification import Specification
@@ -121,8 +121,11 @@ def splits(network: Specification) -> list[Split]:
     for node in network.nodes:
         exits = [(k, network.arcs[k]) for k in arcs.get(node.id, ())]
         if exits:
-            controls = [arc.control for _, arc in exits if arc.control is not None]
-            free = [(k, arc.share) for k, arc in exits if arc.control is None]
+            controlled_exits = {
+                k: arc.control for k, arc in exits if arc.control is not None and arc.control.kind is ControlKind.SHARE
+            }
+            controls = controlled_exits.values()
+            free = [(k, arc.share) for k, arc in exits if k not in controlled_exits]
             sides: list[list[Any]] = [[getattr(c, side) for c in controls] for side in ("low", "neutral", "high")]
             shares: list[Any] = [np.nan if share is None else share for _, share in free]
             values = [*(value for side in sides for value in side), *shares]
@@ -135,7 +138,7 @@ def splits(network: Specification) -> list[Split]:
             stated = np.array(shares, dtype=float).reshape(-1, columns)
             split = Split(
                 donor=node.id,
-                controlled_arcs=tuple(k for k, arc in exits if arc.control is not None),
+                controlled_arcs=tuple(controlled_exits),
                 other_arcs=tuple(k for k, _ in free),
                 bounds=np.broadcast_to(bounds, (3, len(controls), horizon)),
                 stated_shares=np.broadcast_to(stated, (len(free), horizon)),

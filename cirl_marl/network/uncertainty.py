@@ -218,6 +218,7 @@ def _lost_capacity(network: Specification, part: Any, path: str) -> str:
     control, remedies = (
         part.control,
         {
+            ControlKind.TRANSFER: "shares are parts of a whole; disturb an uncontrolled transfer",
             ControlKind.SHARE: "shares are parts of a whole; disturb an uncontrolled share, or what the donor releases",
             ControlKind.STRETCH: "disturb the stretch of the node",
             ControlKind.INPUT: "the input of a model is no capacity",
@@ -268,7 +269,7 @@ def draw_network(network: Any, factors: Sequence[float] = (), path: Floats | Non
     for number, factor in drawn.items():
         part, name = _uncertain_field(network, number)
         if name == "control":
-            most = 1.0 if part.control.kind is ControlKind.SHARE else math.inf
+            most = 1.0 if part.control.kind in (ControlKind.SHARE, ControlKind.TRANSFER) else math.inf
             sides = {side: getattr(part.control, side) for side in ("low", "neutral", "high")}
             drawn_sides = {side: _times(network, value, float(factor), most) for side, value in sides.items()}
             change(part, name, replace(part.control, **drawn_sides))

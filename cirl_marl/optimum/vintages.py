@@ -24,8 +24,9 @@ from typing import Annotated, Any
 import numpy as np
 from scipy import sparse
 
+from cirl_marl.dynamics.components import simulated_network
 from cirl_marl.dynamics.laws import ArcRates
-from cirl_marl.dynamics.stages import StagedNetwork, simulated_network, staged_network
+from cirl_marl.dynamics.stages import StagedNetwork, staged_network
 from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import positional_record

@@ -13,7 +13,7 @@ from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import episode_start, first_seed, rollout
 from cirl_marl.controllers.schedule import control_names
 from cirl_marl.definitions.data_files import CsvRows, number_in
-from cirl_marl.dynamics.stages import simulated_network
+from cirl_marl.dynamics.components import simulated_network
 from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import MultiAgentVectorEnv

@@ -12,6 +12,7 @@ from cirl_marl.network.disturbances import disturbance_problems
 from cirl_marl.network.elements import IDENTIFIER, Arc, ControlKind, Law
 from cirl_marl.network.specification import Specification
 from cirl_marl.network.split_fractions import splits, trap_problems
+from cirl_marl.network.substances import separation_problems
 from cirl_marl.network.uncertainty import uncertainty_problems
 from cirl_marl.network.units import factor
 from cirl_marl.network.validation.accounts import account_problems
@@ -19,6 +20,7 @@ from cirl_marl.network.validation.compartments import arc_problems, node_problem
 from cirl_marl.network.validation.services import service_problems, supply_problems
 from cirl_marl.network.validation.settings import calendar_problems, repetitions, setting_problems
 from cirl_marl.network.validation.stocks import lifetime_problems, series_problems, storage_problems
+from cirl_marl.network.validation.substances import substance_problems
 
 
 def problems(network: Specification) -> Iterator[str]:
@@ -45,6 +47,9 @@ def problems(network: Specification) -> Iterator[str]:
     yield from _name_problems([("service", service.id) for service in network.services])
     yield from _name_problems([("account", account.id) for account in network.accounts])
     yield from account_problems(network)
+    yield from _name_problems([("substance", substance.id) for substance in network.substances])
+    strange = [*substance_problems(network)]
+    yield from strange
     nodes = {node.id: node for node in network.nodes}
     compartments = {c.id: c for c in (*network.nodes, *network.arcs)}
     outflows: dict[str, list[Arc]] = {}
@@ -56,7 +61,7 @@ def problems(network: Specification) -> Iterator[str]:
         yield from node_problems(network, node)
         yield from storage_problems(node, outflows.get(node.id, ()))
         yield from lifetime_problems(network, node, [*inflows.get(node.id, ()), *outflows.get(node.id, ())])
-    lawful = True
+    lawful = not strange
     for arc in network.arcs:
         faults = list(arc_problems(network, arc, nodes, compartments))
         yield from faults
@@ -73,7 +78,7 @@ def problems(network: Specification) -> Iterator[str]:
     if lawful:
         divisions = splits(network)
         faults_of_splits = [problem for split in divisions for problem in split.problems()]
-        yield from faults_of_splits or trap_problems(network, divisions)
+        yield from faults_of_splits or [*trap_problems(network, divisions), *separation_problems(network)]
     yield from port_problems(network)
     yield from service_problems(network)
     yield from supply_problems(network)

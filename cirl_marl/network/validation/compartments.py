@@ -206,10 +206,10 @@ def _control_problems(
         yield f"{subject}: control.low {low.min():g} is negative; a valve cannot reverse a flow"
     elif control.kind is ControlKind.STRETCH and low.min() <= 0:
         yield f"{subject}: control.low {low.min():g}: a stretch is above 0"
-    elif control.kind is ControlKind.SHARE and (low.min() < 0 or high.max() > 1):
+    elif control.kind in (ControlKind.SHARE, ControlKind.TRANSFER) and (low.min() < 0 or high.max() > 1):
         yield f"{subject}: control: shares lie in [0, 1], got [{low.min():g}, {high.max():g}]"
-    if control.kind is ControlKind.SHARE and not isinstance(compartment, Arc):
-        yield f"{subject}: control.kind 'share' belongs on an arc of law 'share'"
+    if control.kind in (ControlKind.SHARE, ControlKind.TRANSFER) and not isinstance(compartment, Arc):
+        yield f"{subject}: control.kind '{control.kind}' belongs on an arc of law 'share'"
     if control.kind is ControlKind.STRETCH and not isinstance(compartment, Node):
         yield f"{subject}: control.kind 'stretch' belongs on a node with a lifetime"
 

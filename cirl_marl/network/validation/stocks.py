@@ -96,9 +96,11 @@ def series_problems(network: Specification) -> Iterator[str]:
 def share_problems(subject: str, arc: Arc, nodes: Mapping[str, Node]) -> Iterator[str]:
     """Yield what does not go with shares, or with an end that stores nothing."""
     kind = arc.control.kind if arc.control else None
-    if kind is ControlKind.SHARE and arc.law is not Law.SHARE:
-        yield f"{subject}: control.kind 'share' needs law 'share', not '{arc.law}'"
-    if arc.law is Law.SHARE and kind not in (None, ControlKind.SHARE):
+    if kind in (ControlKind.SHARE, ControlKind.TRANSFER) and arc.law is not Law.SHARE:
+        yield f"{subject}: control.kind '{kind}' needs law 'share', not '{arc.law}'"
+    if kind is ControlKind.TRANSFER and arc.control is not None and not arc.control.substances:
+        yield f"{subject}: control.kind 'transfer' needs control.substances, whose share it sets"
+    if arc.law is Law.SHARE and kind not in (None, ControlKind.SHARE, ControlKind.TRANSFER):
         remedy = f"a valve on '{arc.donor}' acts on all that it releases"
         yield f"{subject}: law 'share' needs control.kind 'share', not '{kind}'; {remedy}"
     if kind is ControlKind.SHARE and arc.share is not None:

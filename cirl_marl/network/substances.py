@@ -1,0 +1,59 @@
+"""What each substance does in a network: where nodes separate it, it has shares of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+from cirl_marl.network.elements import Arc, ControlKind, Law, Node
+from cirl_marl.network.specification import Specification
+from cirl_marl.network.split_fractions import splits, trap_problems
+
+REMAINDER = "remainder"
+"""What that of a stock is called which is no substance."""
+
+
+def arc_of_substance(arc: Arc, substance: str) -> Arc:
+    """Return an arc as a substance takes it: of law ``share`` with the share of that substance."""
+    control, transfer = arc.control, dict(arc.transfer)
+    if arc.law is not Law.SHARE or (control is None and not transfer):
+        return arc
+    if control is not None and substance in control.substances:
+        return replace(arc, share=None, control=replace(control, kind=ControlKind.SHARE, substances=()), transfer=())
+    if substance in transfer:
+        return replace(arc, share=transfer[substance], control=None, transfer=())
+    if control is not None and control.kind is ControlKind.TRANSFER:
+        control = None
+    return replace(arc, control=control, transfer=())
+
+
+def network_of_substance(network: Specification, substance: str) -> Specification:
+    """Return the nodes and arcs of a network as a substance takes them."""
+    arcs = tuple(arc_of_substance(arc, substance) for arc in network.arcs)
+    return Specification(name=network.name, nodes=network.nodes, arcs=arcs, episode=network.episode)
+
+
+def separated_substances(network: Specification) -> list[str]:
+    """Return the substances that some node separates, in the order of the network."""
+    names = {id_ for arc in network.arcs for id_ in dict(arc.transfer)}
+    names |= {id_ for arc in network.arcs if arc.control is not None for id_ in arc.control.substances}
+    return [substance.id for substance in network.substances if substance.id in names]
+
+
+def contents(network: Specification, node: Node) -> list[float]:
+    """Return the parts of a node's initial stock: what is no substance, then each substance; they sum to 1."""
+    content: dict[str, Any] = dict(node.content)
+    parts = [float(content.get(substance.id, 0.0)) for substance in network.substances]
+    return [max(1.0 - sum(parts), 0.0), *parts]
+
+
+def separation_problems(network: Specification) -> Iterator[str]:
+    """Yield what is wrong with the shares of substances, of a network whose shares of all else are right."""
+    for substance in separated_substances(network):
+        of_substance = network_of_substance(network, substance)
+        divisions = splits(of_substance)
+        faults = [problem for split in divisions for problem in split.problems()] or trap_problems(
+            of_substance, divisions
+        )
+        yield from (f"substance '{substance}': {fault}" for fault in faults)

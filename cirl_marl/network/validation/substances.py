@@ -1,0 +1,88 @@
+"""What is wrong with the substances of a network, and with what is said of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from cirl_marl.errors import unknown_name
+from cirl_marl.network.elements import Arc, ControlKind, Law, Node
+from cirl_marl.network.specification import Specification
+from cirl_marl.network.split_fractions import SUMS
+from cirl_marl.network.substances import REMAINDER
+
+
+def substance_problems(network: Specification) -> Iterator[str]:
+    """Yield every mistake in the substances of ``network``, but for sums of shares."""
+    substances = [substance.id for substance in network.substances]
+    if REMAINDER in substances:
+        yield f"substance '{REMAINDER}': the id is that of what is no substance; choose another"
+    for node in network.nodes:
+        if node.content:
+            yield from _content_problems(node, substances)
+    for arc in network.arcs:
+        yield from _transfer_problems(arc, substances)
+    yield from _service_problems(network, substances)
+    if substances:
+        yield from _motion_problems(network)
+        sources = {id_ for node in network.nodes for id_, part in dict(node.content).items() if part}
+        for id_ in substances:
+            if id_ not in sources:
+                yield f"substance '{id_}': no node has any of it; give the content of stocks, such as that of a source"
+
+
+def _content_problems(node: Node, substances: list[str]) -> Iterator[str]:
+    subject = f"node '{node.id}': content"
+    for id_ in dict(node.content):
+        if id_ not in substances:
+            yield f"{subject}: {unknown_name('substance', id_, substances)}"
+    if not node.stores:
+        yield f"{subject}: it stores nothing, and what it hands on has the content of what enters it"
+    parts: Any = dict(node.content).values()
+    total = sum(parts)
+    if total > 1 + SUMS:
+        yield f"{subject}: its substances sum to {total:g} of its mass, more than 1"
+
+
+def _transfer_problems(arc: Arc, substances: list[str]) -> Iterator[str]:
+    subject, control = f"arc '{arc.id}'", arc.control
+    named = () if control is None else control.substances
+    if arc.transfer and arc.law is not Law.SHARE:
+        yield f"{subject}: transfer: law '{arc.law}' takes none; substances are separated by arcs of law 'share'"
+    for key, ids in (("transfer", dict(arc.transfer)), ("control.substances", named)):
+        for id_ in ids:
+            if id_ not in substances:
+                yield f"{subject}: {key}: {unknown_name('substance', id_, substances)}"
+    for id_ in dict(arc.transfer):
+        if id_ in named:
+            yield f"{subject}: transfer.{id_}: its control sets it; leave it out"
+    if named and control is not None and control.kind is not ControlKind.TRANSFER:
+        yield f"{subject}: control.substances: kind '{control.kind}' takes none; kind 'transfer' sets their share"
+
+
+def _service_problems(network: Specification, substances: list[str]) -> Iterator[str]:
+    makes_up = {arc.makes_up_for for arc in network.arcs}
+    for service in network.services:
+        subject = f"service '{service.id}': substance"
+        if not service.substance:
+            continue
+        if service.substance not in substances:
+            yield f"{subject}: {unknown_name('substance', service.substance, substances)}"
+        if service.quantity == "measure":
+            yield f"{subject}: a measure of a model has no content; ask for that of a stock or flow"
+        if service.id in makes_up:
+            yield f"{subject}: no flow makes up for a content; leave out makes_up_for"
+
+
+def _motion_problems(network: Specification) -> Iterator[str]:
+    """Yield what moves otherwise than substances can be followed."""
+    solver = network.episode.solver
+    if solver != "exact":
+        yield f"substances: solver '{solver}' does not follow them; leave out solver and solver_step"
+    for compartment in (*network.nodes, *network.arcs):
+        if compartment.model is not None:
+            kind = type(compartment).__name__.lower()
+            yield f"{kind} '{compartment.id}': model: inner physics does not follow substances"
+    for arc in network.arcs:
+        if arc.law in (Law.BATCH, Law.RECIPIENT, Law.COMPARTMENT):
+            yield f"arc '{arc.id}': law '{arc.law}' does not follow substances; take 'donor', 'share' or a schedule"

@@ -1,0 +1,307 @@
+"""Substances: what is in stocks and flows, how nodes separate it, and what services demand of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cirl_marl import (
+    Arc,
+    CirlError,
+    Control,
+    ControlKind,
+    Episode,
+    Law,
+    Network,
+    Node,
+    Role,
+    Service,
+    Substance,
+    gradient,
+    load_network,
+)
+from cirl_marl.definitions.writer import definition_of
+from cirl_marl.environments.vector import MultiAgentVectorEnv
+from cirl_marl.network.elements import Lifetime
+from tests.conftest import random_network, with_substances
+
+substances_networks = st.builds(
+    lambda seed, nodes, arcs, lifetimes: with_substances(random_network(seed, nodes, arcs, lifetimes=lifetimes), seed),
+    st.integers(0, 2**32 - 1),
+    st.integers(2, 12),
+    st.integers(1, 20),
+    st.booleans(),
+)
+COPPER = (Substance(id="copper", scale=0.01),)
+
+
+def rollout_of(network: Network, copies: int, seed: int) -> tuple[MultiAgentVectorEnv, list[np.ndarray]]:
+    """Return an environment at the end of an episode of random actions, and its masses after each interval."""
+    env = MultiAgentVectorEnv(network, num_envs=copies)
+    env.reset(seed=seed)
+    rng, stocks = np.random.default_rng(seed), [env.physical.stock]
+    for _ in range(network.episode.horizon):
+        entries = len(env.actuators.control_rows)
+        env.advance(np.repeat(rng.uniform(-1, 1, (entries, 1)), copies, axis=1))
+        stocks.append(env.physical.stock)
+    return env, stocks
+
+
+@given(network=substances_networks, seed=st.integers(0, 1000))
+def test_every_substance_is_conserved_and_within_the_whole(network: Network, seed: int) -> None:
+    """Each is conserved to 1e-12 of its mass, none is negative, and together they are at most the whole."""
+    env, stocks = rollout_of(network, 2, seed)
+    rows, count = env.rows, len(network.substances)
+    for masses in stocks:
+        parts = rows.substances(masses).reshape(count, -1, 2)
+        before = rows.substances(stocks[0]).reshape(count, -1, 2)
+        np.testing.assert_allclose(parts.sum(axis=1), before.sum(axis=1), rtol=1e-12)
+        assert parts.min() >= 0
+        assert (parts.sum(axis=0) <= rows.stocks(masses) * (1 + 1e-12)).all()
+    whole = [rows.stocks(masses).sum() for masses in stocks]
+    np.testing.assert_allclose(whole, whole[0], rtol=1e-12)
+
+
+@given(network=substances_networks, seed=st.integers(0, 1000))
+def test_balances_of_each_node_hold_for_each_substance(network: Network, seed: int) -> None:
+    """What a stock gains of a substance in an interval is what flows in less what flows out, in flows of infos."""
+    env = MultiAgentVectorEnv(network, num_envs=2)
+    env.reset(seed=seed)
+    before, length, stores = env.physical.stock, network.episode.control_interval, len(network.stores)
+    outcome = env.advance(np.zeros((len(env.actuators.control_rows), 2)))
+    info = env.team_info(outcome)
+    incidence = np.zeros((len(network.nodes), len(network.arcs)))
+    incidence[network.recipients, np.arange(len(network.arcs))] += 1
+    incidence[network.donors, np.arange(len(network.arcs))] -= 1
+    size = 1e-9 + env.rows.stocks(before).sum()
+    for i, substance in enumerate(network.substances):
+        held = [
+            env.rows.substances(m).reshape(len(network.substances), stores, 2)[i] for m in (before, env.physical.stock)
+        ]
+        change = incidence @ info["substances"][substance.id].T * length
+        np.testing.assert_allclose(change[:stores], held[1] - held[0], atol=1e-11 * size)
+        np.testing.assert_allclose(change[stores:], 0.0, atol=1e-11 * size)
+        assert (info["substances"][substance.id] <= info["flows"] * (1 + 1e-9) + 1e-12 * size).all()
+
+
+@given(network=substances_networks, seed=st.integers(0, 1000))
+def test_copies_are_alone_and_a_substance_that_is_nowhere_separated_changes_nothing(
+    network: Network, seed: int
+) -> None:
+    """A copy has the bits that it has alone; without separation the whole moves as it does without substances."""
+    _, together = rollout_of(network, 3, seed)
+    env, alone = rollout_of(network, 1, seed)
+    for left, right in zip(together, alone, strict=True):
+        np.testing.assert_array_equal(left[:, :1], right)
+    if any(arc.transfer or (arc.control and arc.control.substances) for arc in network.arcs):
+        return
+    services = tuple(service for service in network.services if not service.substance)
+    nodes = tuple(replace(node, content={}) for node in network.nodes)
+    plain = replace(network, substances=(), services=services, nodes=nodes)
+    other, masses = rollout_of(plain, 1, seed)
+    size = float(other.rows.stocks(masses[0]).sum())
+    for left, right in zip(alone, masses, strict=True):
+        np.testing.assert_allclose(env.rows.stocks(left), other.rows.stocks(right), atol=1e-11 * size)
+
+
+@given(network=substances_networks, seed=st.integers(0, 1000))
+def test_derivatives_are_those_of_differences(network: Network, seed: int) -> None:
+    """Exact gradients of λ̄ and levels, contents among them, by actions agree with central differences."""
+    env = MultiAgentVectorEnv(network, num_envs=1)
+    env.reset(seed=seed)
+    rng, entries = np.random.default_rng(seed), len(env.actuators.control_rows)
+    if not entries:
+        return
+    weights = rng.uniform(0.5, 1.5, len(network.services))
+    scale = network.objective.circularity_scale
+
+    def value(actions: np.ndarray) -> float:
+        found = gradient(env, actions, circularity=1 / scale, levels=weights)
+        return float(found.circularity[0] / scale + weights @ found.levels[:, 0])
+
+    actions = rng.uniform(-0.8, 0.8, (network.episode.horizon, entries, 1))
+    exact = gradient(env, actions, circularity=1 / scale, levels=weights).actions
+    direction = rng.choice([-1.0, 1.0], actions.shape)
+    slopes = [(value(actions + d * direction) - value(actions - d * direction)) / (2 * d) for d in (1e-4, 1e-5, 1e-6)]
+    one_sided = [(value(actions + s * 1e-6 * direction) - value(actions)) / (s * 1e-6) for s in (1, -1)]
+    if abs(one_sided[0] - one_sided[1]) > 1e-3 * (1 + abs(one_sided[0])):
+        return  # a kink
+    error = min(abs(slope - float((exact * direction).sum())) for slope in slopes)
+    assert error <= 1e-6 * (1.0 + float(np.abs(exact).sum()))
+
+
+@given(network=substances_networks)
+def test_definitions_read_back(network: Network, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Contents, transfers and services of substances go to a file and back to the last bit."""
+    path = tmp_path_factory.mktemp("substances") / "network.toml"
+    path.write_text(definition_of(network))
+    again = load_network(path)
+    assert (again.substances, again.nodes, again.arcs) == (network.substances, network.nodes, network.arcs)
+    assert again.services == network.services
+
+
+def sorting_line(*, transfer: float = 0.8, lifetime: Lifetime | None = None, controlled: bool = False) -> Network:
+    """Return a network in which half of a stock of 100 t with 2 % copper is shredded and sorted in a year."""
+    control = Control(kind=ControlKind.TRANSFER, low=0.0, neutral=0.5, high=0.9, substances=("copper",))
+    own = {"control": control} if controlled else {"transfer": {"copper": transfer}}
+    return Network(
+        name="sorting",
+        nodes=(
+            Node(
+                id="use",
+                initial=(100.0, 100.0),
+                content={"copper": 0.02},
+                rate=0.0 if lifetime else np.log(2),
+                lifetime=lifetime,
+            ),
+            Node(id="shredder", stores=False),
+            Node(id="scrap", initial=(0.0, 0.0)),
+            Node(id="waste", initial=(0.0, 0.0), role=Role.LANDFILL),
+        ),
+        arcs=(
+            Arc(id="scrapping", donor="use", recipient="shredder", law=Law.SHARE),
+            Arc(id="recovery", donor="shredder", recipient="scrap", law=Law.SHARE),
+            Arc(id="rejects", donor="shredder", recipient="waste", law=Law.SHARE, share=0.1, **own),
+        ),
+        services=(Service(id="purity", provider="recovery", quantity="flow", substance="copper", low=0.0, high=0.002),),
+        substances=COPPER,
+        episode=Episode(control_interval=1.0, horizon=1),
+    )
+
+
+def test_separation_in_closed_form() -> None:
+    """Of 49 t iron and 1 t copper 10 % and 80 % are rejected; content and level follow by hand."""
+    env, stocks = rollout_of(sorting_line(), 1, 0)
+    copper = env.rows.substances(stocks[-1])[:, 0]
+    np.testing.assert_allclose(copper, [1.0, 0.2, 0.8], rtol=1e-12)
+    np.testing.assert_allclose(env.rows.stocks(stocks[-1])[:, 0], [50.0, 44.1 + 0.2, 4.9 + 0.8], rtol=1e-12)
+    assert env.physical.service[0, 0] == pytest.approx(0.002 / (0.2 / 44.3), rel=1e-12)
+
+
+@pytest.mark.parametrize("setting", [-1.0, 0.3, 1.0])
+def test_who_sets_a_transfer_acts_on_the_substance_alone(setting: float) -> None:
+    """The share of copper is what the control sets, that of all else is stated."""
+    env = MultiAgentVectorEnv(sorting_line(controlled=True), num_envs=1)
+    env.reset(seed=0)
+    env.advance(np.array([[setting]]))
+    rejected = env.rows.substances(env.physical.stock)[2, 0]
+    assert rejected == pytest.approx(0.45 * (setting + 1), abs=1e-12)
+    assert env.rows.stocks(env.physical.stock)[2, 0] == pytest.approx(4.9 + rejected, rel=1e-12)
+
+
+def test_lifetimes_keep_the_content_of_what_entered() -> None:
+    """Of a fixed lifetime comes out what went in: first the old stock with 2 %, then what has none."""
+    network = sorting_line(lifetime=Lifetime(mean=3.0, distribution="fixed"), transfer=0.1)
+    source = Node(id="ore", initial=(500.0, 500.0), role=Role.NONRENEWABLE_RESERVOIR)
+    mining = Arc(id="mining", donor="ore", recipient="use", law=Law.EXOGENOUS, flow=20.0)
+    network = replace(
+        network,
+        nodes=(*network.nodes, source),
+        arcs=(*network.arcs, mining),
+        episode=Episode(control_interval=1.0, horizon=6),
+    )
+    env = MultiAgentVectorEnv(network, num_envs=1)
+    env.reset(seed=0)
+    contents = []
+    for _ in range(6):
+        outcome = env.advance(np.zeros((0, 1)))
+        flows = env.team_info(outcome)["substances"]["copper"][0]
+        contents.append(flows[0] / outcome.flow[0, 0])
+    np.testing.assert_allclose(contents, [0.02] * 3 + [0.0] * 3, atol=1e-12)
+
+
+def test_scheduled_flows_carry_the_content_at_the_start_of_a_substep() -> None:
+    """The error of a mixed stock that a schedule empties is of first order in the substep."""
+
+    def copper_left(step: float) -> float:
+        network = Network(
+            name="mixing",
+            nodes=(
+                Node(id="ore", initial=(100.0, 100.0), role=Role.NONRENEWABLE_RESERVOIR),
+                Node(id="scrap", initial=(10.0, 10.0), content={"copper": 0.1}),
+                Node(id="use", initial=(0.0, 0.0)),
+            ),
+            arcs=(
+                Arc(id="mining", donor="ore", recipient="scrap", law=Law.EXOGENOUS, flow=5.0),
+                Arc(id="melting", donor="scrap", recipient="use", law=Law.EXOGENOUS, flow=5.0),
+            ),
+            substances=COPPER,
+            episode=Episode(control_interval=1.0, horizon=1, solver_step=step),
+        )
+        env, stocks = rollout_of(network.with_options(), 1, 0)
+        return float(env.rows.substances(stocks[-1])[1, 0])
+
+    exact = np.exp(-0.5)  # dx/dt = −5·x/10
+    errors = [abs(copper_left(step) - exact) for step in (0.1, 0.05, 0.025)]
+    ratios = np.divide(errors[:-1], errors[1:])
+    assert errors[-1] < 0.005 and ((ratios > 1.9) & (ratios < 2.1)).all()
+
+
+def test_observations_show_own_content() -> None:
+    """A compartment sees the content of itself and of its ends, in parts of the scale of the substance."""
+    env = MultiAgentVectorEnv(sorting_line(controlled=True), num_envs=1)
+    seen = dict(zip(env.observation_names["rejects"], env.reset(seed=0)["rejects"][0].tolist(), strict=True))
+    assert seen["copper in shredder"] == pytest.approx(2.0, rel=1e-6)
+    assert seen["copper in rejects"] == pytest.approx(0.5 * 0.02 / (0.1 * 0.98 + 0.5 * 0.02) / 0.01, rel=1e-6)
+
+
+def with_content(network: Network, **content: float) -> Network:
+    """Return a network whose first stock has this content."""
+    return replace(network, nodes=(replace(network.nodes[0], content=content), *network.nodes[1:]))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda n: with_content(n, coper=0.1), "unknown substance 'coper'. Did you mean 'copper'"),
+        (lambda n: with_content(n, copper=1.5), "content.copper 1.5 must lie in"),
+        (lambda n: with_content(n), "substance 'copper': no node has any of it"),
+        (
+            lambda n: replace(
+                n,
+                substances=(*COPPER, Substance(id="tin")),
+                nodes=(replace(n.nodes[0], content={"copper": 0.6, "tin": 0.7}), *n.nodes[1:]),
+            ),
+            "its substances sum to 1.3 of its mass",
+        ),
+        (
+            lambda n: replace(
+                n, arcs=(*n.arcs[:1], replace(n.arcs[1], share=0.9, transfer={"copper": 0.1}), n.arcs[2])
+            ),
+            "substance 'copper': node 'shredder': the shares of its arcs sum to 0.9",
+        ),
+        (
+            lambda n: replace(n, services=(replace(n.services[0], substance="cop"),)),
+            "service 'purity': substance: unknown substance 'cop'",
+        ),
+        (lambda n: n.with_options(episode={"solver": "rk4", "solver_step": 0.1}), "solver 'rk4' does not follow them"),
+        (
+            lambda n: replace(
+                n, arcs=(replace(n.arcs[0], law=Law.DONOR, rate=1.0, transfer={"copper": 0.1}), *n.arcs[1:])
+            ),
+            "transfer: law 'donor' takes none",
+        ),
+        (
+            lambda n: replace(n, nodes=(*n.nodes[:3], replace(n.nodes[3], content={"copper": 0.1}))),
+            "it stores nothing, and what it hands on has the content of what enters it",
+        ),
+    ],
+)
+def test_mistakes_are_named(change, message: str) -> None:  # type: ignore[no-untyped-def]
+    """What cannot be is refused, with the object, its value and the nearest valid one."""
+    with pytest.raises(CirlError, match="(?s)" + message.replace(".", r"\.")):
+        change(sorting_line())
+
+
+def test_files_name_what_is_wrong(tmp_path: Path) -> None:
+    """A definition with a content of an unknown substance is refused with its path."""
+    text = definition_of(sorting_line()).replace("content = {copper", "content = {cooper")
+    path = tmp_path / "sorting.toml"
+    path.write_text(text)
+    with pytest.raises(CirlError, match=r"nodes\.use\.content: unknown substance 'cooper'\. Did you mean 'copper'"):
+        load_network(path)
