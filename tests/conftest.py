@@ -442,14 +442,19 @@ def _joined(
     return replace(service, also=tuple(others))
 
 
+def _drawn_network(seed: int, nodes: int, arcs: int, solver: str, *, lifetimes: bool) -> Network:
+    network = random_network(seed, nodes, arcs, runge_kutta=solver == "rk4", lifetimes=lifetimes)
+    return with_substances(network, seed) if solver == "substances" else network
+
+
 st.register_type_strategy(
     Network,
     st.builds(
-        random_network,
+        _drawn_network,
         st.integers(0, 2**32 - 1),
         st.integers(1, 12),
         st.integers(0, 20),
-        runge_kutta=st.sampled_from([False, False, True]),
+        st.sampled_from(["exact", "substances", "rk4"]),
         lifetimes=st.sampled_from([False, False, True]),
     ),
 )

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import random_network, with_substances
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -28,7 +29,6 @@ from cirl_marl import (
 from cirl_marl.definitions.writer import definition_of
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network.elements import Lifetime
-from tests.conftest import random_network, with_substances
 
 substances_networks = st.builds(
     lambda seed, nodes, arcs, lifetimes: with_substances(random_network(seed, nodes, arcs, lifetimes=lifetimes), seed),

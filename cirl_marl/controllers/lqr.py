@@ -241,6 +241,7 @@ def _nonlinear(network: Network, agents: Sequence[str]) -> Iterator[str]:
     obstacles = {
         ControlKind.RATE: "rate controls multiply flows (bilinear)",
         ControlKind.SHARE: "shares multiply flows (bilinear)",
+        ControlKind.TRANSFER: "transfers multiply flows of substances (bilinear)",
         ControlKind.INPUT: "inputs set no flows",
     }
     for kind, reason in obstacles.items():

@@ -60,6 +60,7 @@ class Rollout:
     inner: Annotated[Floats, "inner states that an agent may see, likewise, shape (steps, states)"]
     controls: Annotated[Floats, "values of all controls, in the rows of ``network.control_rows``, (steps, controls)"]
     shortage: Annotated[Floats, "what scheduled flows lacked, mean over copies, shape (steps, scheduled arcs), mass"]
+    contents: Annotated[Floats, "of each substance in nodes and flows, first copy, (steps, substances, compartments)"]
     final_stock: Annotated[Floats, "mean over copies of the last stocks, shape (stores,), mass"]
     mean_flow: Annotated[Floats, "mean over copies and time of the flows, shape (arcs,), mass/time"]
     disturbances: Annotated[Floats, "their values in each interval, shape (B, steps, names)"]
@@ -134,7 +135,8 @@ def rollout(
     local, returns = np.zeros((2, len(env.agents), env.num_envs))
     stock, flow = np.empty((steps, len(env.network.stores))), np.empty((steps, len(env.network.arcs)))
     load, inner = np.empty((steps, len(batches.lines))), np.empty((steps, len(physics.visible)))
-    total_flow = np.zeros(len(env.network.arcs))
+    total_flow, places = np.zeros(len(env.network.arcs)), len(env.network.compartments)
+    contents = np.zeros((steps, len(env.network.substances), places))
     orders = np.flatnonzero(env.dynamics.is_scheduled[: len(total_flow)])
     controls = np.empty((steps, len(env.dynamics.neutral)))
     shortage = np.zeros((steps, len(orders)))
@@ -159,6 +161,8 @@ def rollout(
         returns += outcome.reward
         stock[t], flow[t] = rows.stocks(env.physical.stock)[:, 0], outcome.flow[:, 0]
         load[t], inner[t] = batches.loads(env.physical.stock)[:, 0], env.physical.inner[physics.visible, 0]
+        if contents.size:
+            contents[t] = env.layout.contents(env.quantities(env.physical))[:, 0].reshape(-1, places)
         total_flow += outcome.flow.mean(axis=1)
         observations = env.by_agent(outcome.observation)
         watch(t + 1)
@@ -182,6 +186,7 @@ def rollout(
         returns,
         *first_copy,
         shortage,
+        contents,
         final,
         flows,
         values,

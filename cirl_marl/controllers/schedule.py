@@ -110,6 +110,7 @@ CONTROL_NAMES = {
     ControlKind.RATE: "valve factor (1)",
     ControlKind.SHARE: "share (1)",
     ControlKind.STRETCH: "lifetime factor (1)",
+    ControlKind.TRANSFER: "share of {substances} (1)",
 }
 """What an agent sets, by the kind of its control; inputs of models have names of their own, which end in their unit."""
 
@@ -121,7 +122,8 @@ def control_names(network: Network, agents: tuple[str, ...]) -> Iterator[str]:
         control, model = network.compartments[agent].control, network.compartments[agent].model
         assert control is not None
         if control.kind in CONTROL_NAMES:
-            yield f"{agent}: {CONTROL_NAMES[control.kind].format(flow_unit=flow_unit)}"
+            substances = ", ".join(control.substances)
+            yield f"{agent}: {CONTROL_NAMES[control.kind].format(flow_unit=flow_unit, substances=substances)}"
         elif model is not None:
             yield from (f"{agent}: {name}" for name in model.input_names)
 

@@ -53,7 +53,7 @@ def component_network(network: StagedNetwork) -> StagedNetwork:
         return network
     stores, stockless = ([node for node in network.nodes if node.stores is stores] for stores in (True, False))
     arcs: list[Arc] = list(network.arcs)
-    every_store, every_stockless = list(stores), list(stockless)
+    all_stores, all_stockless = list(stores), list(stockless)
     originals: dict[str, str] = {}
     maps: dict[str, dict[str, object]] = {
         "stages": dict(network.stages),
@@ -66,8 +66,8 @@ def component_network(network: StagedNetwork) -> StagedNetwork:
         def name(id_: str, substance: str = substance) -> str:
             return f"{id_}.{substance}"
 
-        for nodes, every in ((stores, every_store), (stockless, every_stockless)):
-            every += [_node_copy(node, name(node.id)) for node in nodes]
+        for nodes, copies in ((stores, all_stores), (stockless, all_stockless)):
+            copies += [_node_copy(node, name(node.id)) for node in nodes]
         arcs += [_arc_copy(arc, substance, name) for arc in network.arcs]
         compartments = [c.id for c in (*network.nodes, *network.arcs)]
         originals |= {name(id_): id_ for id_ in compartments}
@@ -76,12 +76,17 @@ def component_network(network: StagedNetwork) -> StagedNetwork:
         maps["release_arcs"] |= {name(node): name(arc) for node, arc in network.release_arcs.items()}
         maps["parts"] |= {name(node.id): network.parts.get(node.id, node.id) for node in network.nodes}
     values = {item.name: getattr(network, item.name) for item in fields(network)}
-    values |= {"nodes": (*every_store, *every_stockless), "arcs": tuple(arcs), **maps}
+    values |= {"nodes": (*all_stores, *all_stockless), "arcs": tuple(arcs), **maps}
     return ComponentNetwork(**values, originals=originals)
 
 
 def simulated_network(network: Network) -> Network:
-    """Return the network whose motion the simulator follows: with lifetimes and components as nodes of their own."""
+    """Return the network whose motion the simulator follows: with lifetimes and components as nodes of their own.
+
+    One that is written in stages already is as it is.
+    """
+    if isinstance(network, StagedNetwork):
+        return network
     if network.substances or any(node.lifetime is not None for node in network.stores):
         return component_network(staged_network(network))
     return network

@@ -41,7 +41,7 @@ class Ledger:
         for kind, parts in groups:
             for i, part in enumerate(parts):
                 for name, declaration in declarations(type(part)).items():
-                    if not isinstance(declaration, Rates):
+                    if not isinstance(declaration, Rates) or declaration.of != "account":
                         continue
                     holds = declaration.per == "stock"
                     charged = [arcs + i] if holds else inflows[i] if kind == "nodes" else [i]

@@ -6,6 +6,8 @@ has of the donor's stock at the start of the substep: f_c = f·x_c/Σx.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from cirl_marl.dynamics.components import ComponentNetwork
@@ -16,6 +18,58 @@ from cirl_marl.network.rowsum import RowSum
 
 KEPT = 1.0 - 1e-12
 """Part of what can be delivered that is delivered, so that rounding overdraws nothing."""
+
+
+class Loads:
+    """Which components scheduled flows carry.
+
+    Attributes:
+        substances: sums of the substances that donors hold, shape (donors, stores).
+    """
+
+    def __init__(
+        self, network: Network, orders: Sequence[int], donors: Integers, arcs: int, stores: int, components: int
+    ) -> None:
+        """Take the arcs that are asked for, in copies of ``arcs`` and ``stores``, and the donors of scheduled flows."""
+        part, of_orders = np.arange(components)[:, None], np.array(orders, dtype=np.intp)
+        order_donors = network.donors[of_orders]
+        self._arcs: Integers = (of_orders + part * arcs).ravel()
+        self._orders: Integers = np.tile(of_orders, components)
+        self._rows: Integers = (order_donors + part * stores).ravel()
+        self._places: Integers = np.tile(np.searchsorted(donors, order_donors), components)
+        wholes = np.flatnonzero(np.isin(donors, order_donors))
+        rows = (donors[wholes] + part[1:] * stores).ravel()
+        shape = (len(donors), stores * components)
+        self.substances = RowSum(np.tile(wholes, components - 1), rows, 1.0, shape)
+
+    def share_out(self, stock: Floats, available_stock: Floats, rate: Floats) -> Floats:
+        """Return the rates, shape (arcs, B), with those of the copies of an order f, which are f·x_c/Σx."""
+        content = stock.take(self._rows, axis=0) * self._per_stock(available_stock)
+        rates = rate.copy()
+        rates[self._arcs] = rate.take(self._orders, axis=0) * content
+        return rates
+
+    def pull_back(
+        self,
+        stock: Floats,
+        available_stock: Floats,
+        rate: Floats,
+        adjoint: Floats,
+        stock_adjoint: Floats,
+        whole_adjoint: Floats,
+    ) -> None:
+        """Turn, in place, the adjoint of what ``share_out`` returned into that of orders, stocks and whole stocks."""
+        per_stock = self._per_stock(available_stock)
+        content, load = stock.take(self._rows, axis=0) * per_stock, adjoint.take(self._arcs, axis=0)
+        by_part = load * rate.take(self._orders, axis=0) * per_stock
+        np.add.at(stock_adjoint, self._rows, by_part)
+        np.add.at(whole_adjoint, self._places, -by_part * content)
+        adjoint[self._arcs] = 0.0
+        np.add.at(adjoint, self._orders, load * content)
+
+    def _per_stock(self, available_stock: Floats) -> Floats:
+        whole = available_stock.take(self._places, axis=0)
+        return np.divide(1.0, whole, out=np.zeros_like(whole), where=whole > 0)
 
 
 class ScheduledFlows:
@@ -31,28 +85,22 @@ class ScheduledFlows:
         components = 1 + len(network.substances) if isinstance(network, ComponentNetwork) else 1
         arcs, stores = len(network.arcs) // components, len(network.stores) // components
         # what comes out of slots is of the component that is in them
-        own = {network.arc_index[arc] for arc in network.lines.values()} if isinstance(network, StagedNetwork) else ()
-        asked = [k for k in np.flatnonzero(is_scheduled).tolist() if k < arcs or k in own]
-        self._arcs: Integers = np.array(asked, dtype=np.intp)
+        lines = {network.arc_index[arc] for arc in network.lines.values()} if isinstance(network, StagedNetwork) else ()
+        orders = [k for k in np.flatnonzero(is_scheduled).tolist() if k < arcs or k in lines]
+        self._arcs: Integers = np.array(orders, dtype=np.intp)
         self._donors, place = np.unique(network.donors[self._arcs], return_inverse=True)
-        whole = np.flatnonzero([components > 1 and k not in own for k in self._arcs.tolist()])
-        part = np.arange(components)[:, None]
-        self._carried: Integers = (self._arcs[whole] + part * arcs).ravel()
-        self._carriers: Integers = np.tile(self._arcs[whole], components)
-        self._carried_rows: Integers = (network.donors[self._arcs[whole]] + part * stores).ravel()
-        self._carried_places: Integers = np.tile(place[whole], components)
-        several = np.unique(place[whole])
-        rows = (self._donors[several] + part[1:] * stores).ravel()
-        shape = (len(self._donors), stores * components)
-        self._others = RowSum(np.tile(several, components - 1), rows, 1.0, shape) if len(whole) else None
         self._slot: Integers = place
         slot = {int(node): i for i, node in enumerate(self._donors)}
         proportional = driver == network.donors
         exits = [k for k, d in enumerate(network.donors) if int(d) in slot and proportional[k]]
         exit_slot = [len(slot) + slot[int(network.donors[k])] for k in exits]
-        places, columns = [*self._slot, *exit_slot], [*self._arcs, *exits]
-        self._outflows = RowSum(places, columns, 1.0, (2 * len(slot), len(network.arcs)))
+        rows, columns = [*self._slot, *exit_slot], [*self._arcs, *exits]
+        self._outflows = RowSum(rows, columns, 1.0, (2 * len(slot), len(network.arcs)))
         self._sum = RowSum(self._slot, np.arange(len(self._arcs)), 1.0, (len(slot), len(self._arcs)))
+        self._loads = None
+        if components > 1:
+            orders = [k for k in orders if k not in lines]
+            self._loads = Loads(network, orders, self._donors, arcs, stores, components)
 
     def cut(self, stock: Floats, rate: Floats) -> Floats:
         """Return the rates, shape (arcs, B), with those of scheduled flows cut; the same array if none is."""
@@ -60,14 +108,7 @@ class ScheduledFlows:
             return rate
         available_stock = self._stocks(stock)
         rate = self._cut(available_stock, rate)
-        if self._others is None:
-            return rate
-        content = stock.take(self._carried_rows, axis=0)
-        whole = available_stock.take(self._carried_places, axis=0)
-        content = np.divide(content, whole, out=np.zeros_like(content), where=whole > 0)
-        carried = rate.copy()
-        carried[self._carried] = rate.take(self._carriers, axis=0) * content
-        return carried
+        return rate if self._loads is None else self._loads.share_out(stock, available_stock, rate)
 
     def _cut(self, available_stock: Floats, rate: Floats) -> Floats:
         demand, turned_over = self._demand(rate)
@@ -88,32 +129,14 @@ class ScheduledFlows:
             return
         available_stock = self._stocks(stock)
         whole_adjoint = np.zeros_like(available_stock)
-        if self._others is not None:
-            self._pull_back_contents(stock, available_stock, rate, adjoint, stock_adjoint, whole_adjoint)
+        if self._loads is not None:
+            orders = self._cut(available_stock, rate)
+            self._loads.pull_back(stock, available_stock, orders, adjoint, stock_adjoint, whole_adjoint)
         self._pull_back_cuts(available_stock, rate, adjoint, whole_adjoint)
-        np.add.at(stock_adjoint, self._donors, whole_adjoint)
-        if self._others is not None:
-            self._others.transpose().add_to(stock_adjoint[: self._others.shape[1]], whole_adjoint)
-
-    def _pull_back_contents(
-        self,
-        stock: Floats,
-        available_stock: Floats,
-        rate: Floats,
-        adjoint: Floats,
-        stock_adjoint: Floats,
-        whole_adjoint: Floats,
-    ) -> None:
-        """Turn, in place, the adjoint of what is carried into that of what is asked for, cut, and of the stocks."""
-        whole = available_stock.take(self._carried_places, axis=0)
-        per_whole = np.divide(1.0, whole, out=np.zeros_like(whole), where=whole > 0)
-        content = stock.take(self._carried_rows, axis=0) * per_whole
-        carried = adjoint.take(self._carried, axis=0)
-        by_part = carried * self._cut(available_stock, rate).take(self._carriers, axis=0) * per_whole
-        np.add.at(stock_adjoint, self._carried_rows, by_part)
-        np.add.at(whole_adjoint, self._carried_places, -by_part * content)
-        adjoint[self._carried] = 0.0
-        np.add.at(adjoint, self._carriers, carried * content)
+        stock_adjoint[self._donors] += whole_adjoint
+        if self._loads is not None:
+            stocks = self._loads.substances.transpose()
+            stocks.add_to(stock_adjoint[: stocks.shape[0]], whole_adjoint)
 
     def _pull_back_cuts(self, available_stock: Floats, rate: Floats, adjoint: Floats, whole_adjoint: Floats) -> None:
         demand, turned_over = self._demand(rate)
@@ -136,12 +159,10 @@ class ScheduledFlows:
 
     def _stocks(self, stock: Floats) -> Floats:
         """Return what each donor holds, all components together, shape (donors, B)."""
-        available_stock = stock.take(self._donors, axis=0)
-        return (
-            available_stock
-            if self._others is None
-            else self._others.add_to(available_stock, stock[: self._others.shape[1]])
-        )
+        stocks = stock.take(self._donors, axis=0)
+        if self._loads is None:
+            return stocks
+        return self._loads.substances.add_to(stocks, stock[: self._loads.substances.shape[1]])
 
     def _demand(self, rate: Floats) -> tuple[Floats, Floats]:
         """Return what is asked of each donor by schedule, mass, and the part of its stock that it turns over."""

@@ -22,11 +22,11 @@ def _numbers_of_shares(network: Network, ranges: Mapping[str, tuple[float, float
     if not isinstance(network, ComponentNetwork):
         return of_arcs
     for substance in (substance.id for substance in network.substances):
-        own = numbers_of(ranges, "arcs", f"transfer.{substance}")
+        transfers = numbers_of(ranges, "arcs", f"transfer.{substance}")
         for original in network.arcs[: len(network.arcs) // (1 + len(network.substances))]:
-            stated = substance in dict(original.transfer)
-            if original.law is Law.SHARE and (number := (own if stated else numbers).get(original.id)) is not None:
-                of_arcs[network.arc_index[f"{original.id}.{substance}"]] = number
+            factors = transfers if substance in dict(original.transfer) else numbers
+            if original.law is Law.SHARE and original.id in factors:
+                of_arcs[network.arc_index[f"{original.id}.{substance}"]] = factors[original.id]
     return of_arcs
 
 

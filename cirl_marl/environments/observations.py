@@ -203,7 +203,8 @@ class ObservationLayout:
         """
         table = self._table if table is None else table
         if self.signals.contents:
-            quantities = self._with_contents(quantities)
+            quantities = quantities.copy()
+            quantities[self.signals.substances] = self.contents(quantities)
         with np.errstate(over="ignore"):
             np.multiply(quantities, self._inverse_scale, out=table[: self.signals.quantities], casting="same_kind")
         table[self.signals.time] = time
@@ -213,13 +214,11 @@ class ObservationLayout:
         observation: NDArray[Any] = table.take(self._index, axis=0)
         return observation
 
-    def _with_contents(self, quantities: Floats) -> Floats:
-        """Return quantities with contents in place of masses of substances; they are 0 where there is nothing."""
-        quantities = quantities.copy()
-        whole = quantities[: self.signals.flows.stop]
-        for mass in (quantities[_slice(rows)] for rows in self.signals.contents):
-            mass[...] = np.divide(mass, whole, out=np.zeros_like(mass), where=whole > 0)
-        return quantities
+    def contents(self, quantities: Floats) -> Floats:
+        """Return the part of each substance in nodes and flows, 0 where there is nothing, in rows of ``substances``."""
+        masses = quantities[self.signals.substances]
+        whole = np.tile(quantities[: self.signals.flows.stop], (len(self.signals.contents), 1))
+        return np.divide(masses, whole, out=np.zeros_like(masses), where=whole > 0)
 
     def double_table(self) -> Floats:
         """Return a table for ``observe`` of double precision."""

@@ -56,7 +56,7 @@ class Scoring:
         self._inverse_scale = np.repeat(inverse_scale[:, None], batch, axis=1)
         services = network.services
         self.service_factors: Floats = np.ones(len(services))
-        self._measured = _measurement(network, services, layout)
+        self._masses = _measurement(network, services, layout)
         self._contents = np.flatnonzero([bool(service.substance) for service in services])
         wholes = [replace(services[s], substance="") for s in self._contents.tolist()]
         self._wholes = _measurement(network, wholes, layout)
@@ -138,17 +138,17 @@ class Scoring:
                 scale.pull_back(np.where(np.isfinite(table), table, 0.0), part, factor_adjoint)
         by_measure = per_low - per_quantity * over
         if not len(self._contents):
-            return self._measured.transpose()(by_measure)
+            return self._masses.transpose()(by_measure)
         whole = self._wholes(quantities)
         by_part = np.divide(by_measure[self._contents], whole, out=np.zeros_like(whole), where=whole > 0)
         by_whole = -by_part * quantity[self._contents]
         by_measure[self._contents] = by_part
-        by_quantity = self._measured.transpose()(by_measure)
+        by_quantity = self._masses.transpose()(by_measure)
         return self._wholes.transpose().add_to(by_quantity, by_whole)
 
     def _measure(self, quantities: Floats) -> Floats:
         """Return what each service measures, shape (services, B); a content is 0 where there is nothing."""
-        quantity = self._measured(quantities)
+        quantity = self._masses(quantities)
         if len(self._contents):
             part, whole = quantity[self._contents], self._wholes(quantities)
             quantity[self._contents] = np.divide(part, whole, out=np.zeros_like(part), where=whole > 0)

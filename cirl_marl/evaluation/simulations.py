@@ -48,16 +48,18 @@ class Simulation:
 
         Columns are year or date at the end, if the network has a start on the calendar, λ at the end and the mean of λ,
         the service level, amounts on accounts, stocks at the end, mean flows, what passes through nodes without stock,
-        masses on the way, inner states that an agent may see, mean ages, and what disturbed the interval.
+        masses on the way, inner states that an agent may see, mean ages, what disturbed the interval, and contents of
+        substances.
         """
         env, run = self.env, self.rollout
         lambdas = (run.circularity[0], run.circularity_mean[0])
         flows = (*run.flow.T, *env.network.throughput(run.flow.T))
         ages = [pyramid.mean_age for pyramid in pyramids(env.network, run, run.start)]
         insides = (*run.load.T, *run.inner.T, *(age[1:] for age in ages), *run.disturbances[0].T)
-        columns = (*lambdas, run.service[0], *run.bookings[0], *run.stock.T, *flows, *insides)
+        contents = run.contents.reshape(len(run.contents), -1).T
+        columns = (*lambdas, run.service[0], *run.bookings[0], *run.stock.T, *flows, *insides, *contents)
         states = [*run.start_load.tolist(), *run.start_inner.tolist(), *(float(age[0]) for age in ages)]
-        states += [None] * run.disturbances.shape[2]
+        states += [None] * (run.disturbances.shape[2] + len(contents))
         first = [*[None] * (3 + len(run.bookings[0])), *run.start.tolist(), *[None] * len(flows), *states]
         times = np.concatenate([[0.0], interval_ends(env.network)])
         clock = zip(times.tolist(), *labels(env.network, times)[1], strict=True)
@@ -76,7 +78,8 @@ class Simulation:
         header += [f"mass on {line.id} ({mass})" for line in self.env.dynamics.batches.lines]
         header += [physics.names[row] for row in physics.visible]
         header += [f"mean age of {node.id} ({time})" for node in network.stores if node.lifetime is not None]
-        return [*header, *disturbance_columns(network)]
+        contents = [f"{part.id} in {id_} (1)" for part in network.substances for id_ in network.compartments]
+        return [*header, *disturbance_columns(network), *contents]
 
     def write(self, path: str | Path) -> Path:
         """Write ``table`` to a CSV file, whole or not at all, and return its path; missing folders are made."""

@@ -17,7 +17,8 @@ from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import positional_record, with_field_docs
 from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Node
-from cirl_marl.network.split_fractions import Split
+from cirl_marl.network.split_fractions import Split, splits
+from cirl_marl.network.substances import network_of_substance, separated_substances
 from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.vintages import Lifetimes
 
@@ -116,6 +117,7 @@ class Admissible:
             wishes = setting[:, :, list(split.controlled_arcs)].transpose(0, 2, 1)
             (low, high), (neutral, _) = share_ranges(split, wishes[[0, 2]]), share_ranges(split, wishes[[1, 1]])
             setting[:, :, arcs] = np.stack([low.T, neutral.T, high.T])
+        split_arcs = _with_separation(network, agents, split_arcs, setting)
         driver = np.where([arc.law is Law.RECIPIENT for arc in network.arcs], network.recipients, network.donors)
         driver[np.array([LAWS[arc.law].is_scheduled for arc in network.arcs], dtype=bool)] = -1
         base = [network.interval_means(LAWS[arc.law].coefficient(arc, network)) for arc in network.arcs]
@@ -269,6 +271,35 @@ def share_ranges(split: Split, wishes: Floats) -> Floats:
     return np.concatenate([low + over * cut, rest[:, None] * split.proportions], axis=1)
 
 
+def _with_separation(
+    network: Network, agents: Sequence[str], split_arcs: Sequence[Split], setting: Floats
+) -> tuple[Split, ...]:
+    """Return the splits, those that separate substances with the ranges of the whole, which widen ``setting``.
+
+    Of the components q_c of what is shared out an arc gets Σ_c s_c q_c: between the least and the greatest s_c of all.
+    """
+    whole = {split.donor: split for split in split_arcs}
+    for substance in separated_substances(network):
+        for split in splits(network_of_substance(network, substance)):
+            arcs = [*split.controlled_arcs, *split.other_arcs]
+            if not any(network.arcs[k].transfer or _sets_transfer(network.arcs[k]) for k in arcs):
+                continue
+            controls = [_control_range(network, network.arcs[k], agents) for k in split.controlled_arcs]
+            wishes = np.array(controls).reshape(len(controls), 3, network.episode.horizon).transpose(1, 0, 2)
+            low, high = share_ranges(split, wishes[[0, 2]])
+            setting[0][:, arcs] = np.minimum(setting[0][:, arcs], low.T)
+            setting[2][:, arcs] = np.maximum(setting[2][:, arcs], high.T)
+            free, last = arcs[:-1], arcs[-1]
+            rest = np.full((1, network.episode.horizon), np.nan)
+            bounds = setting[:, :, free].transpose(0, 2, 1)
+            whole[split.donor] = Split(split.donor, tuple(free), (last,), bounds, rest)
+    return tuple(whole.values())
+
+
+def _sets_transfer(arc: Arc) -> bool:
+    return arc.control is not None and arc.control.kind is ControlKind.TRANSFER
+
+
 def _control_range(network: Network, compartment: Compartment, agents: Sequence[str]) -> Floats:
     """Return the lowest, neutral and highest value of a control, shape (3, steps)."""
     bounds = network.control_bounds[:, network.control_rows[compartment.id].start]
@@ -282,7 +313,7 @@ def _setter(network: Network, arc: Arc) -> Arc | Node | None:
     donor = network.nodes[network.node_index[arc.donor]]
     if arc.law is Law.CONTROLLED and donor.control is not None and donor.control.kind is ControlKind.FLOW:
         return donor
-    return arc if arc.control is not None else None
+    return arc if arc.control is not None and not _sets_transfer(arc) else None
 
 
 def _exclusions(network: Network) -> Iterator[str]:

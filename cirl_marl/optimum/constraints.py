@@ -188,10 +188,13 @@ def _hold_schedules(rows: ProgramRows, arcs: Integers, moment: Integers, first: 
 def service_levels(ranges: IntervalRanges, rows: ProgramRows) -> None:
     """Add low·level − q ≤ 0 for each service and ±Δ·σ_env·f̄ − imbalance ≤ 0; their keys are (1, …).
 
-    The level is at most min(1, q/low): a finite upper end of the band could only lower it further.
+    The level is at most min(1, q/low): a finite upper end of the band could only lower it further. Of contents, which
+    the program does not follow, nothing is said.
     """
     layout, network, count = rows.layout, ranges.network, len(rows.layout.moments)
     for s, service in enumerate(network.services):
+        if service.substance:
+            continue
         row = rows.add(1, s)
         rows.put(row, layout.level + s, ranges.service_low[s])  # level ≤ q/low; level ≤ 1 is a box
         if service.quantity == "stock":

@@ -117,6 +117,9 @@ def prices(bound: Bound) -> Floats:
     if bound.min_service is not None:
         multipliers = -bound.certificate.under[len(bound.certificate.under) - len(services) :]
         services = np.maximum(multipliers, scale)
+        # of contents the program says nothing, not even a price
+        contents = [bool(service.substance) for service in bound.network.services]
+        services[contents] = max(scale, bound.network.objective.circularity_scale)
     return PENALTY * np.concatenate([services, budgets])
 
 

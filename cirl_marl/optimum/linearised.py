@@ -41,8 +41,8 @@ def slopes_of(bound: Bound, dynamics: Dynamics) -> int:
 def jacobians(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats, Floats]:
     """Return ∂(x', f̄)/∂x and ∂(x', f̄)/∂a of every interval, and what each ends with, around the bound's actions.
 
-    Shapes are (steps, stocks + arcs, stocks), (steps, stocks + arcs, entries) and (steps, stocks); stocks are those of
-    the simulator, by stage where there is a lifetime.
+    Shapes are (steps, rows, stocks), (steps, rows, entries) and (steps, rows); stocks are those of the simulator, by
+    stage where there is a lifetime. Rows are stocks x', mean flows f̄ and those of each substance.
     """
     network = bound.network
     steps, entries = bound.actions.shape
@@ -64,10 +64,11 @@ def jacobians(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats, Floats]
     _, done = supply.advance(
         stocks, inner, actuators.controls(flat[nodes:], interval), interval, supply.idle(actuators.agents)
     )
-    outputs = np.concatenate([done.stock[rows.nodes], done.moved_mass / network.episode.control_interval])
+    flows = np.concatenate([done.moved_mass, done.moved_substances]) / network.episode.control_interval
+    outputs = np.concatenate([done.stock[rows.nodes], flows])
     by_interval = outputs.reshape(len(outputs), steps, -1).transpose(1, 0, 2)
     slopes = (by_interval[:, :, :-1] - by_interval[:, :, -1:]) / shift[:, None]
-    return slopes[:, :, :nodes], slopes[:, :, nodes:], stock[1:]
+    return slopes[:, :, :nodes], slopes[:, :, nodes:], np.ascontiguousarray(by_interval[:, :, -1])
 
 
 @positional_record
@@ -133,7 +134,7 @@ def step_program(
     """
     network, limits = bound.network, bound.aims.limits if limits is None else limits
     steps, entries = bound.actions.shape
-    stocks, services, is_absolute = slopes[2], len(network.services), network.objective.net_zero == "abs"
+    state, services, is_absolute = slopes[2], len(network.services), network.objective.net_zero == "abs"
     size = entries + services + 1
     level, imbalance, count = entries, size - 1, size * steps + services + len(limits)
     step_low, step_high = np.maximum(-trust, -1 - bound.actions), np.minimum(trust, 1 - bound.actions)
@@ -141,11 +142,11 @@ def step_program(
     low = np.array([network.interval_means(service.low) for service in network.services]).reshape(services, steps)
     low *= 1.0 + margin
     measure, by_stage, imbalances = _measures(bound, dynamics)
+    contents = _contents(bound, dynamics)
     accounts = _account_shares(Ledger(network).rates(), dynamics)
     weights = -bound.aims.objective(-_circularity_cost(bound, dynamics), accounts)
     cost, spent = np.zeros(count), np.zeros((len(limits), count))
     budgets = _account_shares(bound.aims.rates(network), dynamics)
-    state = np.concatenate([stocks, run.flow], axis=1)
     columns = size * np.arange(steps)[:, None] + np.arange(size)
     rows: list[sparse.csr_array] = []
     rights: list[Floats] = []
@@ -157,6 +158,11 @@ def step_program(
         # low·level − δq ≤ q; −δx ≤ x; and ±(φ + δφ) ≤ imbalance, with q, x and φ those of the simulated episode
         table, limit, own = -by_stage @ response, by_stage @ state[t], np.zeros((len(measure), size))
         own[np.arange(services), level + np.arange(services)] = low[:, t]
+        for s, part, whole, most in contents:
+            # level·part ≤ most·whole, to first order: part·level + level₀·δpart − most·δwhole ≤ most·whole
+            share, mass = run.levels[0, s, t], float(part @ state[t])
+            table[s] = (share * part - most[t] * whole) @ response
+            limit[s], own[s, level + s] = most[t] * float(whole @ state[t]), mass
         is_near = abs(table) @ furthest[: t + 1].ravel() > limit - own.sum(axis=1)
         if is_absolute:
             own[-2:, imbalance], is_near[-2:] = -1.0, True
@@ -243,11 +249,36 @@ def _measures(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats, Floats]
     if network.objective.net_zero == "abs":
         rows += [sign * np.append(np.zeros(stores), imbalances) for sign in (-1.0, 1.0)]
     measure = np.array(rows).reshape(-1, len(columns))
-    by_stage = np.zeros((len(measure), dynamics.rows.nodes.stop + len(network.arcs)))
+    by_stage = np.zeros((len(measure), dynamics.rows.nodes.stop + len(network.arcs) * dynamics.rows.components))
     for store in range(stores):
         by_stage[:, np.atleast_1d(dynamics.rows.stages.get(store, store))] = measure[:, [store]]
-    by_stage[:, dynamics.rows.nodes.stop :] = measure[:, stores:]
+    flows = slice(dynamics.rows.nodes.stop, dynamics.rows.nodes.stop + len(network.arcs))
+    by_stage[:, flows] = measure[:, stores:]
     return measure, by_stage, imbalances
+
+
+def _contents(bound: Bound, dynamics: Dynamics) -> list[tuple[int, Floats, Floats, Floats]]:
+    """Return each service of a content: its number, what reads its substance and its whole, and its upper end.
+
+    Both read the rows of Jacobians, shape (rows,); the upper end has shape (steps,).
+    """
+    network, rows, arcs = bound.network, dynamics.rows, len(bound.network.arcs)
+    stocks, contents = rows.nodes.stop, []
+    names = [substance.id for substance in network.substances]
+    for s, service in enumerate(network.services):
+        if not service.substance:
+            continue
+        number = 1 + names.index(service.substance)
+        part, whole = np.zeros((2, stocks + arcs * rows.components))
+        if service.quantity == "stock":
+            for store in (network.node_index[node] for node in service.providers):
+                by_component = rows.stages[store].reshape(rows.components, -1)
+                part[by_component[number]], whole[by_component.ravel()] = 1.0, 1.0
+        else:
+            columns = stocks + network.service_arcs(service)
+            part[columns + number * arcs], whole[columns] = 1.0, 1.0
+        contents.append((s, part, whole, network.interval_means(service.high)))
+    return contents
 
 
 def _circularity_cost(bound: Bound, dynamics: Dynamics) -> Floats:
@@ -255,7 +286,8 @@ def _circularity_cost(bound: Bound, dynamics: Dynamics) -> Floats:
     network, steps = bound.network, len(bound.actions)
     weights = network.circularity_weights
     counted = weights[0] if network.objective.net_zero == "abs" else weights.sum(axis=0)
-    cost = np.concatenate([np.zeros(dynamics.rows.nodes.stop), -counted / steps])
+    of_substances = np.zeros(len(network.arcs) * (dynamics.rows.components - 1))
+    cost = np.concatenate([np.zeros(dynamics.rows.nodes.stop), -counted / steps, of_substances])
     return np.broadcast_to(cost, (steps, len(cost)))
 
 
@@ -266,4 +298,5 @@ def _account_shares(rates: RateTables, dynamics: Dynamics) -> Floats:
     stages = np.zeros((by_stock.shape[2], dynamics.rows.nodes.stop))
     for store in range(len(stages)):
         stages[store, np.atleast_1d(dynamics.rows.stages.get(store, store))] = 1.0
-    return np.concatenate([by_stock / 2 @ stages, by_flow], axis=2)
+    of_substances = np.zeros((*by_flow.shape[:2], by_flow.shape[2] * (dynamics.rows.components - 1)))
+    return np.concatenate([by_stock / 2 @ stages, by_flow, of_substances], axis=2)

@@ -160,8 +160,12 @@ class MPC(Planner):
 
         Raises:
             NoCertificate: for a network whose flows are not linear laws; see ``bound``.
-            CirlError: for another number of demanded levels than services.
+            CirlError: for another number of demanded levels than services, or services of contents, which programs of
+                windows do not follow.
         """
+        if contents := [service.id for service in env.network.services if service.substance]:
+            fault = f"MPC plans masses, not contents, of which {', '.join(contents)} are"
+            raise CirlError(f"network '{env.network.name}': {fault}; take 'optimum' or a learner")
         network, (horizon, replan, futures) = env.network, self._options
         self._aims = aims = aims_of(network, self._aim, self._at_most)
         aims.refuse_years("MPC", "plans know what is left of a total, not of a year; take optimum control")

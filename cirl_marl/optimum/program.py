@@ -17,6 +17,7 @@ from scipy import sparse
 from cirl_marl.dynamics.ledger import Ledger
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import frozen_record
+from cirl_marl.network.substances import separated_substances
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.aims import Aims, account_rows, over
 from cirl_marl.optimum.constraints import (
@@ -122,7 +123,9 @@ class Programs:
             chain_form = Admissible.of(lifetimes.reach_network, admissible.agents) if has_lifetimes else admissible
             system = ComparisonSystem(chain_form, cache)
         self.system = system
-        constant_shares = constant_shares and not hold_controls and layout is None
+        # where nodes separate substances the shares of the whole change with its content
+        separates = bool(separated_substances(admissible.network))
+        constant_shares = constant_shares and not (hold_controls or separates) and layout is None
         self._transit: Transit | None = None
         self.layout = layout = layout or _layout(admissible, system.substeps, merge_pieces, degree, large)
         if constant_shares and layout.size * len(admissible.kinds) <= LARGE:

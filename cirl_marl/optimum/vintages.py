@@ -24,7 +24,7 @@ from typing import Annotated, Any
 import numpy as np
 from scipy import sparse
 
-from cirl_marl.dynamics.components import simulated_network
+from cirl_marl.dynamics.components import ComponentNetwork, simulated_network
 from cirl_marl.dynamics.laws import ArcRates
 from cirl_marl.dynamics.stages import StagedNetwork, staged_network
 from cirl_marl.dynamics.state_layout import StateLayout
@@ -45,7 +45,7 @@ class WholeLifetime:
     """A lifetime as the program has it."""
 
     node: Annotated[Node, "whose it is"]
-    rows: Annotated[Integers, "of its stages, or slots, among the stocks of the simulator"]
+    rows: Annotated[Integers, "of its stages, or slots, among the stocks of the simulator, shape (components, stages)"]
     exit_arc: Annotated[int, "the arc of the planned network through which what has lived goes"]
     inflow_arcs: Annotated[Integers, "its arcs through which something enters"]
     rate: Annotated[Floats, "μ in each interval, shape (steps,), 1/time; empty for a fixed one"]
@@ -60,9 +60,14 @@ class WholeLifetime:
         assert self.node.lifetime is not None and self.node.lifetime.chain is not None
         return self.node.lifetime.chain
 
+    def masses(self, initial: Floats) -> Floats:
+        """Return what is in its stages, or slots, of all stocks of the simulator, mass."""
+        masses: Floats = initial[self.rows].sum(axis=0)
+        return masses
+
     def slots(self, initial: Floats) -> Floats:
         """Return what is in the slots of a fixed lifetime, first what comes out first, of all stocks, mass."""
-        masses = initial[self.rows]
+        masses = self.masses(initial)
         # what rounding left of what came out before comes with the oldest
         return np.concatenate([[masses[-2] + masses[-1]], masses[-3::-1]])
 
@@ -98,6 +103,7 @@ class Lifetimes:
         self.state_layout = StateLayout(self.simulator_network)
         self.whole: list[WholeLifetime] = []
         self.cache = IntervalCache()
+        components = self.state_layout.components
         nodes = [node for node in network.stores if node.lifetime is not None]
         if nodes:
             fixed_nodes = [node.id for node in nodes if node.lifetime is not None and node.lifetime.chain is None]
@@ -118,7 +124,7 @@ class Lifetimes:
             self.whole.append(
                 WholeLifetime(
                     node=node,
-                    rows=self.state_layout.stages.get(place, np.array([place])),
+                    rows=self.state_layout.stages.get(place, np.array([place])).reshape(components, -1),
                     exit_arc=plan_network.arc_index[plan_network.release_arcs[node.id]],
                     inflow_arcs=np.flatnonzero(plan_network.recipients == plan_network.node_index[node.id]),
                     rate=rate,
@@ -184,7 +190,7 @@ class Lifetimes:
                 stretch, node = self._stretch_rows(lifetime, layout, intervals), lifetime.node.id
                 stock = _column_sums(ends + self.plan_network.node_index[node], width)
                 blocks.append(stretch.matrix(stock, outflow, inflow))
-                limits.append(stretch.limits(initial[lifetime.rows]))
+                limits.append(stretch.limits(lifetime.masses(initial)))
                 continue
             # L − c̄ U ≤ from_start and c̲ U − L ≤ −from_start, in the columns of what leaves and of what enters
             write = self._chain_kernels if len(lifetime.rate) else self._line_kernels
@@ -209,7 +215,7 @@ class Lifetimes:
             outflow = unit_outflow(lifetime.chain, rate, layout.length, layout.degree)
             outflow = outflow[:: layout.pieces].reshape(steps, -1)
         else:
-            delay = len(lifetime.rows) - 1
+            delay = lifetime.rows.shape[1] - 1
             shares = np.kron(np.eye(steps, k=delay - 1), np.ones((1, moments)))
             outflow = np.asarray(shares / self.network.episode.control_interval, dtype=float)
         return np.concatenate([outflow, -outflow], axis=1)
@@ -230,7 +236,7 @@ class Lifetimes:
                 once = lifetime.rate[period] * interval
                 entered = flow[:, lifetime.inflow_arcs].sum(axis=1) * interval
                 stock = plan[:, layout.last][:, self.plan_network.node_index[lifetime.node.id]]
-                turnover, masses = once * lifetime.factor[:, period], initial[lifetime.rows]
+                turnover, masses = once * lifetime.factor[:, period], lifetime.masses(initial)
                 stretches[lifetime.node.id] = once / planned_turnovers(lifetime.chain, turnover, masses, entered, stock)
         return stretches
 
@@ -263,7 +269,7 @@ class Lifetimes:
         by_piece, count = np.repeat(rate, layout.pieces), len(intervals) * len(layout.moments)
         kernel = self.cache.value(key, lambda: Kernel(lifetime.chain, by_piece, layout.length, layout.degree))
         low, high = (sparse.csr_array(bound.reshape(count, count)) for bound in (kernel.low, kernel.high))
-        return low, high, (kernel.start_outflow @ initial[lifetime.rows]).ravel()
+        return low, high, (kernel.start_outflow @ lifetime.masses(initial)).ravel()
 
     def _line_kernels(
         self, lifetime: WholeLifetime, layout: Layout, initial: Floats, intervals: range
@@ -287,9 +293,13 @@ def _column_sums(columns: Integers, width: int) -> Any:
 def _sums(fine: Network, coarse: Network) -> Any:
     """Return what the nodes of one writing of a network are of those of another that is written out further."""
     stages = fine.stages if isinstance(fine, StagedNetwork) else {}
+    copies: dict[str, list[str]] = {}
+    for copy_, original in (fine.originals if isinstance(fine, ComponentNetwork) else {}).items():
+        copies.setdefault(original, []).append(copy_)
     whole = coarse.stages if isinstance(coarse, StagedNetwork) else {}
     sums = sparse.lil_array((len(coarse.nodes), len(fine.nodes)))
     for i, node in enumerate(coarse.nodes):
         for part in (node.id,) if len(whole.get(node.id, ())) > 1 else stages.get(node.id, (node.id,)):
-            sums[i, fine.node_index[part]] = 1.0
+            for component in (part, *copies.get(part, ())):
+                sums[i, fine.node_index[component]] = 1.0
     return sparse.csr_array(sums)

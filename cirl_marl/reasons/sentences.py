@@ -191,6 +191,7 @@ def action_text(network: Network, agent: str, leaf: Leaf) -> str:
     amount = {
         ControlKind.FLOW: f"{number(value)} {network.mass_unit}/{network.time_unit}",
         ControlKind.SHARE: f"{100 * value:.3g} %{donor}",
+        ControlKind.TRANSFER: f"{100 * value:.3g} % of the {' and '.join(control.substances)}{donor}",
         ControlKind.STRETCH: f"a lifetime {100 * (value - 1):+.0f} %".replace("-", "−"),
         ControlKind.RATE: f"{100 * value:.3g} % of its flow",
     }[control.kind]

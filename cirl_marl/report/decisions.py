@@ -25,6 +25,8 @@ from cirl_marl.report.terminal import text_table
 
 SHOWN_LEVERS = 10
 """Largest number of levers in a table on screen."""
+SHARES = (ControlKind.SHARE, ControlKind.TRANSFER)
+"""Kinds of controls that are read in percent."""
 NO_WORKBOOK = "no workbook (.xlsx) beside it: it needs openpyxl: pip install 'cirl-marl[excel]'"
 
 
@@ -58,7 +60,7 @@ class Lever(Setting):
         value, usual = float(self.plan[step]), float(self.usual[step])
         if self.kind is ControlKind.STRETCH:
             return f"lifetime {100 * (value - 1):+.0f} %"
-        if self.kind is ControlKind.SHARE:
+        if self.kind in SHARES:
             return f"{100 * value:.1f} % of {self.of} ({100 * (value - usual):+.1f} points)"
         if self.kind is ControlKind.RATE:
             return f"flow {100 * (value - 1):+.0f} %"
@@ -76,6 +78,8 @@ def settings(network: Network, agents: Sequence[str]) -> Iterator[Setting]:
         names = model.input_names if control.kind is ControlKind.INPUT and model is not None else ("",)
         unit = {ControlKind.FLOW: flow, ControlKind.INPUT: ""}.get(control.kind, "1")
         donor = network.compartments[compartment.donor].label if isinstance(compartment, Arc) else ""
+        if control.substances:
+            donor = f"{', '.join(control.substances)} in {donor}"
         for name, row in zip(names, range(rows.start, rows.stop), strict=True):
             title = _title(network, compartment) + (f", {name}" if name else "")
             yield Setting(agent, title, control.kind, donor, unit, row)
@@ -214,7 +218,7 @@ def save_decisions(path: str | Path, schedule: Schedule, *, title: str = "") -> 
     panels = [Panel("mean circularity", mass, partial(_draw, time=time, plan=plan, usual=usual))]
     for lever in [lever for lever in levers(schedule) if lever.change > 0][: PANELS - 1]:
         unit, factor, limits = lever.unit, 1, None
-        if lever.kind is ControlKind.SHARE:
+        if lever.kind in SHARES:
             unit, factor, limits = f"% of {lever.of}", 100, (0.0, None)
         elif lever.kind is ControlKind.STRETCH:
             unit = "factor on lifetime"

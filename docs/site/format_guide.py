@@ -31,6 +31,7 @@ PARTS: dict[str, tuple[Any, str]] = {
     "model": (schema.ModelTable, "`model` of a node or an arc"),
     "service": (schema.ServiceTable, "`[services.NAME]`"),
     "account": (schema.AccountTable, "`[accounts.NAME]`"),
+    "substance": (schema.SubstanceTable, "`[substances.NAME]`"),
     **{kind: (table, f'`[disturbances.NAME]` with `kind = "{kind}"`') for kind, table in schema.DISTURBANCES.items()},
     "correlation": (schema.CorrelationTable, "`[disturbance_correlation]`"),
     "quantity": (quantities.QuantityTable, "Every number with a unit"),

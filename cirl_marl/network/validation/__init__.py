@@ -17,10 +17,10 @@ from cirl_marl.network.uncertainty import uncertainty_problems
 from cirl_marl.network.units import factor
 from cirl_marl.network.validation.accounts import account_problems
 from cirl_marl.network.validation.compartments import arc_problems, node_problems, port_problems
+from cirl_marl.network.validation.contents import substance_problems
 from cirl_marl.network.validation.services import service_problems, supply_problems
 from cirl_marl.network.validation.settings import calendar_problems, repetitions, setting_problems
 from cirl_marl.network.validation.stocks import lifetime_problems, series_problems, storage_problems
-from cirl_marl.network.validation.substances import substance_problems
 
 
 def problems(network: Specification) -> Iterator[str]:

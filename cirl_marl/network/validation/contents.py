@@ -46,17 +46,17 @@ def _content_problems(node: Node, substances: list[str]) -> Iterator[str]:
 
 def _transfer_problems(arc: Arc, substances: list[str]) -> Iterator[str]:
     subject, control = f"arc '{arc.id}'", arc.control
-    named = () if control is None else control.substances
+    controlled = () if control is None else control.substances
     if arc.transfer and arc.law is not Law.SHARE:
         yield f"{subject}: transfer: law '{arc.law}' takes none; substances are separated by arcs of law 'share'"
-    for key, ids in (("transfer", dict(arc.transfer)), ("control.substances", named)):
+    for key, ids in (("transfer", dict(arc.transfer)), ("control.substances", controlled)):
         for id_ in ids:
             if id_ not in substances:
                 yield f"{subject}: {key}: {unknown_name('substance', id_, substances)}"
     for id_ in dict(arc.transfer):
-        if id_ in named:
+        if id_ in controlled:
             yield f"{subject}: transfer.{id_}: its control sets it; leave it out"
-    if named and control is not None and control.kind is not ControlKind.TRANSFER:
+    if controlled and control is not None and control.kind is not ControlKind.TRANSFER:
         yield f"{subject}: control.substances: kind '{control.kind}' takes none; kind 'transfer' sets their share"
 
 
