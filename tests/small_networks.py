@@ -188,7 +188,19 @@ def without_lifetimes(network: Network) -> Network:
     return replace(network, nodes=tuple(nodes))
 
 
-plain_networks = st.from_type(Network).map(without_lifetimes)
+def without_substances(network: Network) -> Network:
+    """Return the network with nothing said of what is in it."""
+    arcs = []
+    for arc in network.arcs:
+        sets_transfer = arc.control is not None and arc.control.kind is ControlKind.TRANSFER
+        arcs.append(replace(arc, transfer=(), control=None if sets_transfer else arc.control))
+    nodes = tuple(replace(node, content=()) for node in network.nodes)
+    services = tuple(service for service in network.services if not service.substance)
+    return replace(network, nodes=nodes, arcs=tuple(arcs), services=services, substances=(), scenarios={})
+
+
+plain_networks = st.from_type(Network).map(without_lifetimes).map(without_substances)
+"""Networks of which every node with a stock is one row of the simulator."""
 
 
 LARGE = ("steel_world",)

@@ -83,6 +83,7 @@ class StepProgram:
     lack: Annotated[Integers, "columns of what services lack and budgets are exceeded by, (services + budgets,)"]
     measured: Annotated[Integers, "interval, and row of ``measure``, of each of the first rows of G, shape (rows, 2)"]
     measure: Annotated[Floats, "what rows read off stocks and mean flows, shape (measures, stores + arcs)"]
+    contents: Annotated[list[int], "rows of ``measure`` that are of contents, which it does not read"]
     aims: Annotated[Aims, "whose budgets the last rows of G keep"]
 
     def with_correction(self, values: Floats, run: Rollout, trial: Rollout) -> StepProgram:
@@ -98,7 +99,8 @@ class StepProgram:
         moves = np.zeros(len(values))
         moves[self.action] = values[self.action]
         limits = self.problem.under_to.copy()
-        limits[: len(row)] += (after - before)[step, row] + self.problem.under[: len(row)] @ moves
+        correction = (after - before)[step, row] + self.problem.under[: len(row)] @ moves
+        limits[: len(row)] += np.where(np.isin(row, self.contents), 0.0, correction)
         first = len(limits) - len(self.aims.budgets)
         limits[first:] -= self.aims.totals(trial) - self.aims.totals(run) - self.problem.under[first:] @ moves
         return replace(self, problem=replace(self.problem, under_to=limits))
@@ -215,6 +217,7 @@ def step_program(
         np.arange(size * steps, count),
         np.concatenate(measured),
         measure,
+        [content[0] for content in contents],
         bound.aims,
     )
 
