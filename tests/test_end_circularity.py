@@ -107,7 +107,7 @@ def test_it_follows_from_the_stocks_at_the_end(network: Network, seed: int) -> N
             low, high = constant(control.low), constant(control.high)
             valve[node] = low + (chosen + 1) / 2 * (high - low)
         outcome = env.advance(action)
-        stock = env.physical.stock[: len(network.nodes)]
+        stock = env.rows.stocks(env.physical.stock)
         rate = np.array([arc.rate for arc in network.arcs]).reshape(-1, 1)
         flow = rate * (valve * stock)[network.donors]
         size = network.objective.reference_interval * flow.sum(axis=0)

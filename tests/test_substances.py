@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 from small_networks import without_substances
 
 from cirl_marl import (
+    MPC,
+    Account,
     Arc,
     CirlError,
     Control,
@@ -24,8 +26,12 @@ from cirl_marl import (
     Role,
     Service,
     Substance,
+    bound,
     gradient,
+    improve_plan,
     load_network,
+    simulate,
+    simulate_plan,
 )
 from cirl_marl.definitions.writer import definition_of
 from cirl_marl.environments.vector import MultiAgentVectorEnv
@@ -303,3 +309,112 @@ def test_files_name_what_is_wrong(tmp_path: Path) -> None:
     path.write_text(text)
     with pytest.raises(CirlError, match=r"nodes\.use\.content: unknown substance 'cooper'\. Did you mean 'copper'"):
         load_network(path)
+
+
+EXAMPLE = Path(__file__).parent.parent / "examples" / "copper_in_steel.toml"
+
+
+def pooling(most_x: float = 100.0, cost_b: float = 16.0) -> tuple[Network, dict[str, float]]:
+    """Return Haverly's pooling problem (1978), of one interval, and what can be sold of its two products."""
+
+    def source(name: str, sulfur: float) -> Node:
+        return Node(id=name, initial=(1e4, 1e4), content={"sulfur": sulfur})
+
+    def order(name: str, donor: str, recipient: str, cost: float) -> Arc:
+        control = Control(kind=ControlKind.FLOW, low=0.0, neutral=0.0, high=600.0)
+        return Arc(
+            id=name, donor=donor, recipient=recipient, law=Law.CONTROLLED, control=control, accounts={"cost": cost}
+        )
+
+    def sale(product: str, price: float) -> Arc:
+        accounts = {"cost": -price, product: 1.0}
+        return Arc(id=f"sold_{product}", donor=f"blend_{product}", recipient=product, law=Law.SHARE, accounts=accounts)
+
+    def quality(product: str, most: float) -> Service:
+        return Service(
+            id=f"pure_{product}", provider=f"sold_{product}", quantity="flow", substance="sulfur", low=0.0, high=most
+        )
+
+    splitting = Control(kind=ControlKind.SHARE, low=0.0, neutral=0.5, high=1.0)
+    network = Network(
+        name="pooling",
+        nodes=(
+            source("a", 0.03),
+            source("b", 0.01),
+            source("c", 0.02),
+            *(Node(id=name, initial=(0.0, 0.0)) for name in ("x", "y")),
+            *(Node(id=name, stores=False) for name in ("pool", "blend_x", "blend_y")),
+        ),
+        arcs=(
+            order("a_in", "a", "pool", 6.0),
+            order("b_in", "b", "pool", cost_b),
+            order("c_to_x", "c", "blend_x", 10.0),
+            order("c_to_y", "c", "blend_y", 10.0),
+            Arc(id="to_x", donor="pool", recipient="blend_x", law=Law.SHARE, control=splitting),
+            Arc(id="to_y", donor="pool", recipient="blend_y", law=Law.SHARE),
+            sale("x", 9.0),
+            sale("y", 15.0),
+        ),
+        services=(quality("x", 0.025), quality("y", 0.015)),
+        accounts=(Account(id="cost", unit="EUR_2023"), Account(id="x", unit="t"), Account(id="y", unit="t")),
+        substances=(Substance(id="sulfur", scale=0.02),),
+        mass_unit="t",
+        time_unit="year",
+        episode=Episode(control_interval=1.0, horizon=1),
+    )
+    return network, {"x": most_x, "y": 200.0}
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize(("options", "optimum"), [({}, 400.0), ({"cost_b": 13.0}, 750.0)])
+def test_plans_solve_pooling_problems(options: dict[str, float], optimum: float) -> None:
+    """Haverly's problems 1 and 3: the plan makes the known profit, and no bound is below it."""
+    network, budgets = pooling(**options)
+    solution = bound(network, aim="cost", at_most=budgets, min_service=1.0)
+    assert solution.objective >= optimum * (1 - 1e-9)
+    run = simulate_plan(improve_plan(solution))
+    assert -run.accounts[0, 0] == pytest.approx(optimum, rel=1e-3)
+    np.testing.assert_allclose(run.episode_levels[0], 1.0, atol=2e-4)
+    assert (run.accounts[0, 1:] <= np.array([100.0, 200.0]) * (1 + 1e-6)).all()
+
+
+@given(network=substances_networks, seed=st.integers(0, 1000))
+def test_no_episode_is_above_the_bound(network: Network, seed: int) -> None:
+    """Whatever agents do, and whatever is separated, λ̄ stays below the bound of the whole."""
+    limit = bound(network).objective
+    env = MultiAgentVectorEnv(network, num_envs=64)
+    middle = dict(zip([node.id for node in network.stores], network.initial.mean(axis=0).tolist(), strict=True))
+    env.reset(seed=seed, options={"initial_state": middle})
+    rng = np.random.default_rng(seed)
+    entries = len(env.actuators.control_rows)
+    for _ in range(network.episode.horizon):
+        env.advance(rng.choice([-1.0, 1.0, 0.0], (entries, 64)))
+    best = float((env.physical.circularity / network.episode.horizon).max())
+    size = network.objective.reference_interval * float(np.abs(env.physical.flow).sum(axis=0).max())
+    assert best <= limit + 1e-9 * (1.0 + abs(limit) + size)
+
+
+def test_the_bound_says_that_contents_are_taken_for_granted() -> None:
+    """Its text names the services, and MPC, which plans masses, refuses them."""
+    assert "it takes clean_flat, clean_long for granted" in str(bound(EXAMPLE, min_service=0.99, degree=1))
+    env = MultiAgentVectorEnv(EXAMPLE, num_envs=1)
+    with pytest.raises(CirlError, match=r"MPC plans masses, not contents, of which clean_flat, clean_long are"):
+        MPC(min_service=0.99).start(env, 0)
+
+
+@pytest.mark.medium
+def test_sorting_lets_more_scrap_into_steel(tmp_path: Path) -> None:
+    """The plan of the example keeps masses and contents; whose sorter stays as it is has less circularity."""
+    limit = bound(EXAMPLE, min_service=0.99, degree=1)
+    run = simulate_plan(improve_plan(limit, starts=1))
+    assert run.episode_levels.min() >= 0.99 - 2e-4
+    assert run.episode_circularity[0] <= limit.objective
+    others = [agent for agent in limit.agents if agent != "rejects"]
+    unsorted = simulate_plan(improve_plan(bound(EXAMPLE, min_service=0.99, degree=1, agents=others), starts=1))
+    assert unsorted.episode_levels.min() >= 0.99 - 2e-4
+    assert unsorted.episode_circularity[0] < run.episode_circularity[0] - 1.0
+    simulation = simulate(EXAMPLE, steps=2)
+    header, rows = simulation.table()
+    place = header.index("copper in scrap (1)")
+    assert rows[0][place] is None
+    assert 0.001 < float(str(rows[1][place])) < 0.004

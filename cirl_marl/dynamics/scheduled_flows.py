@@ -14,7 +14,7 @@ from cirl_marl.dynamics.components import ComponentNetwork
 from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.compartment_model import Bools
-from cirl_marl.network.rowsum import RowSum
+from cirl_marl.network.rowsum import NEGLIGIBLE, RowSum
 
 KEPT = 1.0 - 1e-12
 """Part of what can be delivered that is delivered, so that rounding overdraws nothing."""
@@ -69,7 +69,7 @@ class Loads:
 
     def _per_stock(self, available_stock: Floats) -> Floats:
         whole = available_stock.take(self._places, axis=0)
-        return np.divide(1.0, whole, out=np.zeros_like(whole), where=whole > 0)
+        return np.divide(1.0, whole, out=np.zeros_like(whole), where=whole > NEGLIGIBLE)
 
 
 class ScheduledFlows:

@@ -15,7 +15,7 @@ from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import OBSERVE, Arc
 from cirl_marl.network.processes import DisturbanceProcesses, interval_of
-from cirl_marl.network.rowsum import RowSum, spans
+from cirl_marl.network.rowsum import NEGLIGIBLE, RowSum, spans
 
 
 class Signals:
@@ -218,7 +218,7 @@ class ObservationLayout:
         """Return the part of each substance in nodes and flows, 0 where there is nothing, in rows of ``substances``."""
         masses = quantities[self.signals.substances]
         whole = np.tile(quantities[: self.signals.flows.stop], (len(self.signals.contents), 1))
-        return np.divide(masses, whole, out=np.zeros_like(masses), where=whole > 0)
+        return np.divide(masses, whole, out=np.zeros_like(masses), where=whole > NEGLIGIBLE)
 
     def double_table(self) -> Floats:
         """Return a table for ``observe`` of double precision."""
@@ -228,13 +228,12 @@ class ObservationLayout:
         """Return derivatives by quantities, levels and sights of those by the observation, shape (entries, B)."""
         signals, by_signal = self.signals, self._signal_sum(adjoint)
         by_quantity = by_signal[: signals.quantities] * self._inverse_scale
-        places = slice(0, signals.flows.stop)
-        per_whole = np.divide(
-            1.0, quantities[places], out=np.zeros_like(quantities[places]), where=quantities[places] > 0
-        )
-        for rows in map(_slice, signals.contents):
-            by_quantity[rows] *= per_whole
-            by_quantity[places] -= by_quantity[rows] * quantities[rows] * per_whole
+        if signals.contents:
+            whole = quantities[: signals.flows.stop]
+            per_whole = np.divide(1.0, whole, out=np.zeros_like(whole), where=whole > NEGLIGIBLE)
+            for rows in map(_slice, signals.contents):
+                by_quantity[rows] *= per_whole
+                by_quantity[: signals.flows.stop] -= by_quantity[rows] * quantities[rows] * per_whole
         return by_quantity, by_signal[signals.levels], by_signal[signals.seen]
 
     def _common_order(self, agents: Sequence[str], mode: str) -> tuple[str, ...]:

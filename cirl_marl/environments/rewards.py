@@ -15,7 +15,7 @@ from cirl_marl.environments.state import State
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import Service
-from cirl_marl.network.rowsum import RowSum
+from cirl_marl.network.rowsum import NEGLIGIBLE, RowSum
 from cirl_marl.network.series import Series
 from cirl_marl.network.uncertainty import numbers_of
 
@@ -107,7 +107,7 @@ class Scoring:
         quantity, (low, high) = self._measure(quantities), self._bands(step, factors)
         level: Floats = np.divide(quantity, low, out=np.ones_like(quantity), where=low > 0)
         if len(self._contents):
-            level[self._contents] = np.where(self._wholes(quantities) > 0, level[self._contents], 1.0)
+            level[self._contents] = np.where(self._wholes(quantities) > NEGLIGIBLE, level[self._contents], 1.0)
         if self._has_high:
             np.divide(high, quantity, out=level, where=quantity > high)
         np.minimum(level, 1.0, out=level)
@@ -140,7 +140,7 @@ class Scoring:
         if not len(self._contents):
             return self._masses.transpose()(by_measure)
         whole = self._wholes(quantities)
-        by_part = np.divide(by_measure[self._contents], whole, out=np.zeros_like(whole), where=whole > 0)
+        by_part = np.divide(by_measure[self._contents], whole, out=np.zeros_like(whole), where=whole > NEGLIGIBLE)
         by_whole = -by_part * quantity[self._contents]
         by_measure[self._contents] = by_part
         by_quantity = self._masses.transpose()(by_measure)
@@ -151,7 +151,7 @@ class Scoring:
         quantity = self._masses(quantities)
         if len(self._contents):
             part, whole = quantity[self._contents], self._wholes(quantities)
-            quantity[self._contents] = np.divide(part, whole, out=np.zeros_like(part), where=whole > 0)
+            quantity[self._contents] = np.divide(part, whole, out=np.zeros_like(part), where=whole > NEGLIGIBLE)
         return quantity
 
     def _bands(self, step: Integers, factors: Floats | None) -> tuple[Floats, Floats]:

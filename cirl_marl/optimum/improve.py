@@ -12,12 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.dynamics.integrator import Dynamics
-from cirl_marl.network import Floats
+from cirl_marl.network import Floats, Integers
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
 from cirl_marl.optimum.bounds import Bound
 from cirl_marl.optimum.linearised import MOST_SLOPES, jacobians, slopes_of, step_program
@@ -40,6 +41,10 @@ REFINEMENT_ROUNDS = 2
 bound's plan, the second for what is left to first order."""
 REFINEMENT_DEGREE = 1
 """Degree of these programs, whatever that of the bound: they are solved several times."""
+CONTENT_STARTS = 4
+"""Actions to begin from where contents are demanded. With 4 Haverly's pooling problems 1 and 3 are solved, 2 is not."""
+DEARER = 10.0
+"""By what the price of a content rises that lacks where no step helps: of contents the bound knows no price."""
 TOLERATED_SHORTFALL = 1e-4
 """What a service may lack of its demand without a further round: a hundredth of a gap of 1 %."""
 
@@ -48,6 +53,7 @@ def improve_plan(
     bound: Bound,
     *,
     rounds: int = 20,
+    starts: int | None = None,
     enough: Callable[[Rollout], bool] = lambda run: False,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Bound:
@@ -55,23 +61,52 @@ def improve_plan(
 
     Plans are compared by the objective of the bound; what each service lacks of ``min_service`` is charged PENALTY
     times what the bound says it costs to provide. Local optimality is all that is sought; ``bound.gap`` says how much
-    better any plan could be. Of a network so large that its Jacobians would have more than MOST_SLOPES entries the plan
-    is made by ``refine``, whatever ``rounds`` is.
+    better any plan could be. With services of contents, whose products with flows have many local optima, random
+    actions are begun from as well (``starts``). Of a network so large that its Jacobians would have more than
+    MOST_SLOPES entries the plan is made by ``refine``, whatever ``rounds`` is.
 
     Args:
         bound: with the actions to start from.
-        rounds: most linear programs to solve.
+        rounds: most linear programs to solve, from each start.
+        starts: how many actions to begin from: those of the bound, then random ones, constant in time and always the
+            same; None: 1, with services of contents CONTENT_STARTS.
         enough: asked of each episode that is better than those before, whether to stop there.
         progress: called with the share of them that is solved; 1 when no more are needed.
     """
-    dynamics = Dynamics(bound.network)
-    if slopes_of(bound, dynamics) > MOST_SLOPES:
+    if slopes_of(bound, Dynamics(bound.network)) > MOST_SLOPES:
         return refine(bound, enough=enough, progress=progress)
+    if starts is None:
+        starts = CONTENT_STARTS if any(service.substance for service in bound.network.services) else 1
+    plans = []
+    for start in range(starts):
+        constant = np.random.default_rng(start).uniform(-1.0, 1.0, bound.actions.shape[1])
+        actions = np.broadcast_to(constant, bound.actions.shape) if start else bound.actions
+        report = partial(_tell, progress, start, starts)
+        plans.append(_climb(replace(bound, actions=actions), rounds, enough, report))
+    if starts == 1:
+        return plans[0]
+    runs, price = [simulate_plan(plan) for plan in plans], prices(bound)
+    ranks = [(-max(shortage(bound, run), TOLERATED_SHORTFALL), penalised_objective(bound, run, price)) for run in runs]
+    return plans[ranks.index(max(ranks))]
+
+
+def _tell(progress: Callable[[float], None], start: int, starts: int, share: float) -> None:
+    """Tell the share of all starts that is done, when ``start`` of them and a share of the next are."""
+    progress((start + share) / starts)
+
+
+def _climb(bound: Bound, rounds: int, enough: Callable[[Rollout], bool], progress: Callable[[float], None]) -> Bound:
+    """Return ``bound`` with better actions, by linear programs around episodes, from its own."""
+    dynamics = Dynamics(bound.network)
     price, lack = prices(bound), np.zeros(len(bound.network.services))
     excess = np.zeros(len(bound.aims.budgets))
     best, run = bound, simulate_plan(bound)
     value, trust, slopes = penalised_objective(bound, run, price), TRUST, None
+    contents = np.flatnonzero([bool(service.substance) for service in bound.network.services])
     for done in range(rounds):
+        if trust < SMALLEST and _lack_of(contents, bound, run) > TOLERATED_SHORTFALL:
+            price[contents] *= DEARER
+            value, trust = penalised_objective(bound, run, price), TRUST
         if trust < SMALLEST or enough(run):
             break
         slopes = jacobians(best, dynamics) if slopes is None else slopes
@@ -117,10 +152,12 @@ def prices(bound: Bound) -> Floats:
     if bound.min_service is not None:
         multipliers = -bound.certificate.under[len(bound.certificate.under) - len(services) :]
         services = np.maximum(multipliers, scale)
-        # of contents the program says nothing, not even a price
-        contents = [bool(service.substance) for service in bound.network.services]
-        services[contents] = max(scale, bound.network.objective.circularity_scale)
     return PENALTY * np.concatenate([services, budgets])
+
+
+def _lack_of(services: Integers, bound: Bound, run: Rollout) -> float:
+    """Return the most that an episode lacks of the levels demanded of some services."""
+    return float((demand(bound) - run.episode_levels[0])[services].max(initial=0.0))
 
 
 def _scale(bound: Bound) -> float:
