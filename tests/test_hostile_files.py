@@ -218,6 +218,9 @@ def test_teams(count: int, tmp_path: Path) -> None:
     (tmp_path / "unseeded" / "team.json").write_text(json.dumps({**written, "seed": -1}))
     with pytest.raises(RunError, match="seed must be a whole number of at least 0, got -1"):
         Team.load(tmp_path / "unseeded", Walk)
+    (tmp_path / "unseeded" / "team.json").write_text(json.dumps({**written, "num_envs": 10**30}))
+    with pytest.raises(RunError, match=r"team\.json: .*num_envs must be at most 10,000, got 1,000,000,000,000,000,000"):
+        Team.load(tmp_path / "unseeded", Walk)
     (tmp_path / "outside").mkdir()
     (tmp_path / "team" / "one.json").rename(tmp_path / "outside" / "one.json")
     (tmp_path / "team" / "one.json").symlink_to(tmp_path / "outside" / "one.json")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import aec_to_parallel, turn_based_aec_to_parallel
 
-from cirl_marl.errors import CirlError, LearnerError, unknown_name
+from cirl_marl.errors import CirlError, LearnerError, unknown_name, whole_number
 from cirl_marl.learners.views import by_part
 from cirl_marl.network import Floats
 
@@ -22,6 +22,8 @@ AgentObservations = NDArray[Any] | dict[str, NDArray[Any]]
 """Observations of an agent in all copies."""
 MASK = "action_mask"
 """Key of an observation, or of the infos, under which PettingZoo's environments tell which actions are legal."""
+MOST_COPIES = 10_000
+"""Most copies of an environment, all of which live in one process."""
 
 
 def parallel(env: Any) -> Any:
@@ -34,6 +36,14 @@ def parallel(env: Any) -> Any:
     if not isinstance(env, ParallelEnv):
         raise CirlError(f"make_env() must return a PettingZoo ParallelEnv or AECEnv, got {type(env).__name__}")
     return env
+
+
+def copies_number(num_envs: int) -> int:
+    """Return a number of copies; a ``CirlError`` says why it is none."""
+    if whole_number("num_envs", num_envs, 1) > MOST_COPIES:
+        reason = "each copy is an environment of its own"
+        raise CirlError(f"num_envs must be at most {MOST_COPIES:,}, got {num_envs:,}: {reason}")
+    return num_envs
 
 
 class Copies:

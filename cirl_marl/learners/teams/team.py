@@ -26,7 +26,7 @@ from cirl_marl.learners.checkpoint import read_tree, write_tree
 from cirl_marl.learners.learner import TENSORBOARD_ADVICE, Learner, derived_seed, has_tensorboard, predict_action
 from cirl_marl.learners.lockstep import Lockstep, Participant, Streams, World, global_streams_claimed
 from cirl_marl.learners.recipe import LearnerSettings, Normalisation
-from cirl_marl.learners.teams.copies import Copies, MakeEnv
+from cirl_marl.learners.teams.copies import Copies, MakeEnv, copies_number
 from cirl_marl.learners.teams.presence import TeamVecEnv, leave_out_absent
 from cirl_marl.learners.trainer import one_torch_thread
 from cirl_marl.records.files import refuse_links
@@ -61,7 +61,7 @@ def independent(
         CirlError: for a pattern that fits nobody, an algorithm or parameter that there is not, a space that the
             algorithm cannot take, or something else than an environment.
     """
-    copies = Copies(make_env, whole_number("num_envs", num_envs, 1))
+    copies = Copies(make_env, copies_number(num_envs))
     settings = {}
     for pattern in overrides or {}:
         if not any(fnmatchcase(agent, pattern) for agent in copies.agents):
@@ -249,10 +249,10 @@ class Team:
         state = read_tree(path, "team")
         try:
             settings = {agent: LearnerSettings.model_validate(spec) for agent, spec in state["agents"].items()}
-            copies = Copies(make_env, whole_number("num_envs", state["num_envs"], 1))
-            seed = whole_number("seed", state["seed"], 0)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            count, seed = copies_number(state["num_envs"]), whole_number("seed", state["seed"], 0)
+        except (KeyError, TypeError, ValueError, AttributeError, CirlError) as error:
             raise RunError(f"{path / 'team.json'}: is not what a team wrote: {error}") from error
+        copies = Copies(make_env, count)
         if set(settings) != set(copies.agents):
             raise RunError(f"{path}: is of the agents {sorted(settings)}, the environment has {sorted(copies.agents)}")
         team = cls(make_env, copies, settings, seed, tensorboard_log)
