@@ -114,7 +114,7 @@ def show(
         ends = [f"at least {service.low:g}"] if extremes(service.low)[1] > 0 else []
         ends += [] if np.isinf(extremes(service.high)[0]) else [f"at most {service.high:g}"]
         variation = ", changing in time" if isinstance(service.low, Series) or isinstance(service.high, Series) else ""
-        subject = f"{service.measure or service.quantity} of {' and '.join(service.providers)}"
+        subject = f"{service.subject} of {' and '.join(service.providers)}"
         common.console.print(f"service '{service.id}': {subject} {' and '.join(ends)}{variation}")
     if definition.disturbed:
         common.console.print(disturbances_table(definition))

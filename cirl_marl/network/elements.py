@@ -463,6 +463,12 @@ class Service(CheckedRecord):
         return (self.provider, *self.also)
 
     @property
+    def subject(self) -> str:
+        """What it measures, in a word or two."""
+        quantity = self.measure or self.quantity
+        return f"{self.substance} in the {quantity}" if self.substance else quantity
+
+    @property
     def debtors(self) -> tuple[str, ...]:
         """Compartments whose local reward bears the shortfall."""
         return self.owed_by or (self.provider,)

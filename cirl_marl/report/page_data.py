@@ -152,7 +152,7 @@ def _service(network: Network, service: Service, sources: Iterable[StatedNumber]
     return {
         "id": service.id,
         "label": service.title or service.id.replace("_", " "),
-        "measured": f"{service.measure or service.quantity} of {providers}",
+        "measured": f"{service.subject} of {providers}",
         "low": _number(low),
         "high": _number(high),
         "told": _sources(sources),
