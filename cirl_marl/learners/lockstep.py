@@ -225,9 +225,11 @@ class NetworkWorld(World):
             RunError: if it holds something else than the arrays of this environment.
         """
         physical = state.get("state") if isinstance(state, Mapping) else None
-        if isinstance(physical, Mapping):  # older ones say nothing of disturbances and accounts, which there were not
-            accounts = np.zeros((len(self.env.network.accounts), self.env.num_envs))
+        if isinstance(physical, Mapping):  # older ones say nothing of what there was not
+            network, batch = self.env.network, self.env.num_envs
+            accounts = np.zeros((len(network.accounts), batch))
             missing = {"processes": no_paths(), "disturbances": no_paths(), "accounts": accounts}
+            missing["substances"] = np.zeros((len(network.substances) * len(network.arcs), batch))
             state = {**state, "state": {**missing, **physical}}
         require_alike(state, self.state_dict(), "the state of the environment")
         streams = tuple(state["streams"])
