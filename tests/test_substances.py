@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import random_network, with_substances
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from small_networks import without_substances
 
@@ -36,6 +36,7 @@ from cirl_marl import (
 from cirl_marl.definitions.writer import definition_of
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network.elements import Lifetime
+from cirl_marl.network.uncertainty import Spread
 
 substances_networks = st.builds(
     lambda seed, nodes, arcs, lifetimes: with_substances(random_network(seed, nodes, arcs, lifetimes=lifetimes), seed),
@@ -137,6 +138,54 @@ def test_derivatives_are_those_of_differences(network: Network, seed: int) -> No
         return  # a kink
     error = min(abs(slope - float((exact * direction).sum())) for slope in slopes)
     assert error <= 1e-6 * (1.0 + float(np.abs(exact).sum()))
+
+
+@given(network=substances_networks, seed=st.integers(0, 1000))
+def test_draws_of_shares_and_transfers_are_networks(network: Network, seed: int) -> None:
+    """An episode that drew shares, transfers and controls is, in all it moves, that of the network with these."""
+    rng, spread = np.random.default_rng(seed), Spread(low=0.7, high=1.1, distribution="uniform")
+    paths = [f"arcs.{arc.id}.transfer.{name}" for arc in network.arcs for name in dict(arc.transfer)]
+    paths += [f"arcs.{arc.id}.share" for arc in network.arcs if arc.share]
+    paths += [
+        f"arcs.{arc.id}.control"
+        for arc in network.arcs
+        if arc.control is not None and arc.control.kind in (ControlKind.TRANSFER, ControlKind.SHARE)
+    ]
+    assume(paths)
+    network = replace(network, uncertain={path: spread for path in paths if rng.random() < 0.7 or path == paths[0]})
+    env = MultiAgentVectorEnv(network, num_envs=3, uncertain=True)
+    env.reset(seed=seed)
+    actions = rng.uniform(-1, 1, (network.episode.horizon, len(env.actuators.control_rows)))
+    middle = dict(zip([node.id for node in network.stores], network.initial.mean(axis=0).tolist(), strict=True))
+    env.reset(seed=seed, options={"initial_state": middle})
+    networks = [env.certain_network(copy) for copy in range(3)]
+    for action in actions:
+        env.advance(np.repeat(action[:, None], 3, axis=1))
+    for copy, certain in enumerate(networks):
+        alone = MultiAgentVectorEnv(certain, num_envs=1)
+        alone.reset(seed=seed, options={"initial_state": middle})
+        for action in actions:
+            alone.advance(action[:, None])
+        masses, expected = alone.physical.stock[:, 0], env.physical.stock[:, copy]
+        np.testing.assert_allclose(masses, expected, rtol=1e-9, atol=1e-10 * expected.sum())
+
+
+def test_draws_without_a_rest_sum_to_one() -> None:
+    """Where every arc states its share of a substance, what was drawn is scaled to a whole."""
+    network = sorting_line()
+    scrapping, recovery, rejects = network.arcs
+    arcs = (scrapping, replace(recovery, share=0.9, transfer={"copper": 0.2}), rejects)
+    spread = Spread(low=0.5, high=1.5, distribution="uniform")
+    network = replace(network, arcs=arcs, uncertain={"arcs.recovery.transfer.copper": spread})
+    env = MultiAgentVectorEnv(network, num_envs=1, uncertain=True)
+    env.reset(seed=3)
+    factor = float(env.physical.factors[0, 0])
+    certain = env.certain_network(0)
+    env.advance(np.zeros((0, 1)))
+    alone, masses = rollout_of(certain, 1, 3)
+    rejected = 0.8 / (0.8 + 0.2 * factor)
+    assert env.rows.substances(env.physical.stock)[2, 0] == pytest.approx(rejected, rel=1e-12)
+    assert alone.rows.substances(masses[-1])[2, 0] == pytest.approx(rejected, rel=1e-12)
 
 
 @given(network=substances_networks)

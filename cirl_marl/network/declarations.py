@@ -311,10 +311,9 @@ def numbers(part_: Any) -> Iterator[tuple[str, Declaration, Any]]:
 
 def with_number(part_: Any, name: str, value: Any, changes: Mapping[str, Any]) -> dict[str, Any]:
     """Return the ``changes`` of fields of a part, by name, with that of the number ``name`` to ``value``."""
-    field, _, account = name.partition(".")
-    if account:
-        rates = changes.get(field, getattr(part_, field))
-        value = tuple((other, value if other == account else rate) for other, rate in rates)
+    field, _, id_ = name.partition(".")
+    if id_:
+        value = tuple({**dict(changes.get(field, getattr(part_, field))), id_: value}.items())
     return {**changes, field: value}
 
 

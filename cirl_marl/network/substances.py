@@ -8,7 +8,7 @@ from typing import Any
 
 from cirl_marl.network.elements import Arc, ControlKind, Law, Node
 from cirl_marl.network.specification import Specification
-from cirl_marl.network.split_fractions import splits, trap_problems
+from cirl_marl.network.split_fractions import Split, splits, trap_problems
 
 REMAINDER = "remainder"
 """What that of a stock is called which is no substance."""
@@ -39,6 +39,12 @@ def separated_substances(network: Specification) -> list[str]:
     names = {id_ for arc in network.arcs for id_ in dict(arc.transfer)}
     names |= {id_ for arc in network.arcs if arc.control is not None for id_ in arc.control.substances}
     return [substance.id for substance in network.substances if substance.id in names]
+
+
+def separates(network: Specification, split: Split) -> bool:
+    """Whether the arcs of a split separate substances."""
+    arcs = [network.arcs[k] for k in (*split.controlled_arcs, *split.other_arcs)]
+    return any(arc.transfer or (arc.control is not None and arc.control.substances) for arc in arcs)
 
 
 def contents(network: Specification, node: Node) -> list[float]:

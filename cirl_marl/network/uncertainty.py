@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any
 
@@ -26,6 +26,7 @@ from cirl_marl.network.rowsum import Floats, Integers, single_column
 from cirl_marl.network.series import Series, Value, extremes, in_intervals
 from cirl_marl.network.specification import Specification
 from cirl_marl.network.split_fractions import ROUNDING, Split, proportions, splits, trap_problems
+from cirl_marl.network.substances import arc_of_substance, network_of_substance, separated_substances, separates
 
 WIDE = 4.0
 """Deviations of a normal distribution up to which every distribution goes that states no range, by probability."""
@@ -283,18 +284,13 @@ def draw_network(network: Any, factors: Sequence[float] = (), path: Floats | Non
         course = value + disturbed.scale * course if disturbed.adds else value * course
         # what stands still throughout is no number that somebody forgot
         change(part, name, in_intervals(course, interval) or Series(times=(0.0,), values=(0.0,)))
-    for split in splits(network):
-        arcs, controlled = ([network.arcs[k] for k in part] for part in (split.other_arcs, split.controlled_arcs))
-        shares_ = [changes.get(id(arc), (arc, {}))[1].get("share", arc.share) for arc in arcs]
-        controls = [changes.get(id(arc), (arc, {}))[1].get("control", arc.control) for arc in controlled]
-        before = [*(arc.share for arc in arcs), *(arc.control for arc in controlled)]
-        if any(value is not old for value, old in zip([*shares_, *controls], before, strict=True)):
-            drawn_shares = np.array([network.interval_means(np.nan if value is None else value) for value in shares_])
-            remainder = 1.0 - split.bounds[1].sum(axis=0)
-            left = 1.0 - sum((network.interval_means(control.neutral) for control in controls), 0.0 * remainder)
-            for arc, shares in zip(arcs, proportions(drawn_shares, remainder) * left, strict=True):
-                if arc.share is not None:
-                    change(arc, "share", in_intervals(shares, interval))
+
+    def drawn_arc(k: int) -> Any:
+        arc = network.arcs[k]
+        return replace(arc, **changes[id(arc)][1]) if id(arc) in changes else arc
+
+    for k, name, share in [*_drawn_shares(network, drawn_arc)]:
+        change(network.arcs[k], name, share)
     initial: dict[str, Any] = dict(zip((node.id for node in network.stores), network.initial.T.tolist(), strict=True))
     for node in network.stores:
         if node.initial is None and node.history is None:
@@ -309,6 +305,29 @@ def draw_network(network: Any, factors: Sequence[float] = (), path: Floats | Non
     groups = {key: tuple(map(with_draws, getattr(network, key))) for key in KINDS}
     certain: dict[str, Any] = {"uncertain": {}, "disturbances": {}, "disturbed": {}, "correlation": None}
     return replace(network, **groups, **certain, scenarios={})
+
+
+def _drawn_shares(network: Any, drawn_arc: Callable[[int], Any]) -> Iterator[tuple[int, str, Any]]:
+    """Yield the shares of arcs, by number and field, of splits of which something was drawn, as parts of a whole."""
+    for substance in ("", *separated_substances(network)):
+        of_substance = network_of_substance(network, substance) if substance else network
+        field = f"transfer.{substance}" if substance else "share"
+        for split in splits(of_substance):
+            free, controlled = (
+                [arc_of_substance(drawn_arc(k), substance) for k in ks]
+                for ks in (split.other_arcs, split.controlled_arcs)
+            )
+            parts = [*(arc.share for arc in free), *(arc.control for arc in controlled)]
+            before = [of_substance.arcs[k].share for k in split.other_arcs]
+            before += [of_substance.arcs[k].control for k in split.controlled_arcs]
+            if parts == before or (substance and not separates(network, split)):
+                continue
+            shares = np.array([network.interval_means(np.nan if arc.share is None else arc.share) for arc in free])
+            remainder = 1.0 - split.bounds[1].sum(axis=0)
+            left = 1.0 - sum((network.interval_means(arc.control.neutral) for arc in controlled), 0.0 * remainder)
+            for k, arc, share in zip(split.other_arcs, free, proportions(shares, remainder) * left, strict=True):
+                if arc.share is not None:
+                    yield k, field, in_intervals(share, network.episode.control_interval)
 
 
 def network_of_intervals(network: Any, intervals: Integers) -> Any:

@@ -18,7 +18,7 @@ from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import positional_record, with_field_docs
 from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Node
 from cirl_marl.network.split_fractions import Split, splits
-from cirl_marl.network.substances import network_of_substance, separated_substances
+from cirl_marl.network.substances import network_of_substance, separated_substances, separates
 from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.vintages import Lifetimes
 
@@ -282,7 +282,7 @@ def _with_separation(
     for substance in separated_substances(network):
         for split in splits(network_of_substance(network, substance)):
             arcs = [*split.controlled_arcs, *split.other_arcs]
-            if not any(network.arcs[k].transfer or _sets_transfer(network.arcs[k]) for k in arcs):
+            if not separates(network, split):
                 continue
             controls = [_control_range(network, network.arcs[k], agents) for k in split.controlled_arcs]
             wishes = np.array(controls).reshape(len(controls), 3, network.episode.horizon).transpose(1, 0, 2)
