@@ -313,10 +313,11 @@ def _drawn_shares(network: Any, drawn_arc: Callable[[int], Any]) -> Iterator[tup
         of_substance = network_of_substance(network, substance) if substance else network
         field = f"transfer.{substance}" if substance else "share"
         for split in splits(of_substance):
-            free, controlled = (
+            arcs: list[list[Any]] = [
                 [arc_of_substance(drawn_arc(k), substance) for k in ks]
                 for ks in (split.other_arcs, split.controlled_arcs)
-            )
+            ]
+            free, controlled = arcs
             parts = [*(arc.share for arc in free), *(arc.control for arc in controlled)]
             before = [of_substance.arcs[k].share for k in split.other_arcs]
             before += [of_substance.arcs[k].control for k in split.controlled_arcs]
