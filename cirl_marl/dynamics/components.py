@@ -16,7 +16,7 @@ from types import MappingProxyType
 
 from cirl_marl.dynamics.stages import StagedNetwork, staged_network
 from cirl_marl.network import Network
-from cirl_marl.network.elements import Arc, Node
+from cirl_marl.network.elements import Arc
 from cirl_marl.network.substances import arc_of_substance
 
 
@@ -67,7 +67,7 @@ def component_network(network: StagedNetwork) -> StagedNetwork:
             return f"{id_}.{substance}"
 
         for nodes, copies in ((stores, all_stores), (stockless, all_stockless)):
-            copies += [_node_copy(node, name(node.id)) for node in nodes]
+            copies += [replace(node, id=name(node.id)) for node in nodes]
         arcs += [_arc_copy(arc, substance, name) for arc in network.arcs]
         compartments = [c.id for c in (*network.nodes, *network.arcs)]
         originals |= {name(id_): id_ for id_ in compartments}
@@ -92,12 +92,6 @@ def simulated_network(network: Network) -> Network:
     return network
 
 
-def _node_copy(node: Node, id_: str) -> Node:
-    return replace(node, id=id_, accounts=(), holding=(), content=())
-
-
 def _arc_copy(arc: Arc, substance: str, name: Callable[[str], str]) -> Arc:
-    """Return the arc of a substance; what limits or makes up for the whole stays with the original."""
     arc = arc_of_substance(arc, substance)
-    arc = replace(arc, id=name(arc.id), donor=name(arc.donor), recipient=name(arc.recipient))
-    return replace(arc, accounts=(), makes_up_for="", weight=None, capacity_node="")
+    return replace(arc, id=name(arc.id), donor=name(arc.donor), recipient=name(arc.recipient))
