@@ -28,6 +28,7 @@ from cirl_marl import (
     Service,
     Substance,
     bound,
+    explain,
     gradient,
     improve_plan,
     load_network,
@@ -39,6 +40,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network.elements import FIXED_LIFETIME, Lifetime
 from cirl_marl.network.series import extremes
 from cirl_marl.network.uncertainty import Spread
+from cirl_marl.optimum.admissible import Admissible
 
 substances_networks = st.builds(
     lambda seed, nodes, arcs, lifetimes: with_substances(random_network(seed, nodes, arcs, lifetimes=lifetimes), seed),
@@ -355,6 +357,36 @@ def with_content(network: Network, **content: float) -> Network:
     return replace(network, nodes=(replace(network.nodes[0], content=content), *network.nodes[1:]))
 
 
+@pytest.mark.parametrize("name", ["release", "entry", "stage_1", "leaving", "use", "scrapping"])
+def test_names_of_substances_are_free(name: str) -> None:
+    """A substance called like a part of a lifetime, a node or an arc moves as under any other name."""
+    network = sorting_line(lifetime=Lifetime(mean=3.0, deviation=1.5))
+    arcs = (*network.arcs[:2], replace(network.arcs[2], transfer={name: 0.8}))
+    nodes = (replace(network.nodes[0], content={name: 0.02}), *network.nodes[1:])
+    services = (replace(network.services[0], substance=name),)
+    other = replace(network, nodes=nodes, arcs=arcs, services=services, substances=(Substance(id=name, scale=0.01),))
+    (env, stocks), (_, expected) = rollout_of(other, 1, 0), rollout_of(network, 1, 0)
+    np.testing.assert_array_equal(stocks[-1], expected[-1])
+    assert f"use.stage_1.{name}" in env.rows.start_names
+
+
+def test_draws_that_no_network_could_have_are_refused() -> None:
+    """Two transfers of which some draws exceed the whole need ranges, as shares do."""
+    network = sorting_line(controlled=True)
+    scrapping, recovery, rejects = network.arcs
+    assert rejects.control is not None
+    arcs = (scrapping, recovery, rejects, replace(rejects, id="more"))
+    spread = Spread(low=0.5, high=1.5, distribution="uniform")
+    with pytest.raises(NetworkError, match="substance 'copper': node 'shredder': some draws of its neutral shares sum"):
+        replace(network, arcs=arcs, uncertain={"arcs.rejects.control": spread})
+
+
+def test_explanations_know_who_sets_transfers() -> None:
+    """Prices of the bounds of a control that sets a transfer are those of the program, which has masses alone."""
+    prices = explain(replace(sorting_line(controlled=True), services=())).prices
+    assert prices is not None and np.isfinite(prices.room).all()
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -378,6 +410,30 @@ def with_content(network: Network, **content: float) -> Network:
         (
             lambda n: replace(n, services=(replace(n.services[0], substance="cop"),)),
             "service 'purity': substance: unknown substance 'cop'",
+        ),
+        (
+            lambda n: replace(n, substances=(Substance(id="copper", scale=0.0),)),
+            "scale 0.0 must be positive and finite",
+        ),
+        (
+            lambda n: replace(
+                n,
+                arcs=(
+                    n.arcs[0],
+                    replace(n.arcs[1], share=0.0, transfer={"copper": 0.2}),
+                    replace(n.arcs[2], share=None, transfer={}),
+                    Arc(
+                        id="supply",
+                        donor="use",
+                        recipient="shredder",
+                        law=Law.CONTROLLED,
+                        makes_up_for="scrap",
+                        control=Control(kind=ControlKind.FLOW, low=0.0, neutral=0.0, high=9.0),
+                    ),
+                ),
+                services=(Service(id="scrap", provider="recovery", quantity="flow", low=1.0),),
+            ),
+            "arc 'supply': makes_up_for 'scrap': what it carries does not reach 'recovery' at once",
         ),
         (lambda n: n.with_options(episode={"solver": "rk4", "solver_step": 0.1}), "solver 'rk4' does not follow them"),
         (
@@ -488,6 +544,23 @@ def test_no_episode_is_above_the_bound(network: Network, seed: int) -> None:
     best = float((env.physical.circularity / network.episode.horizon).max())
     size = network.objective.reference_interval * float(np.abs(env.physical.flow).sum(axis=0).max())
     assert best <= limit + 1e-9 * (1.0 + abs(limit) + size)
+
+
+@given(network=substances_networks, seed=st.integers(0, 1000))
+def test_shares_of_the_whole_are_in_the_ranges_of_programs(network: Network, seed: int) -> None:
+    """Of what leaves a node an arc gets, of all components, between the least and the greatest share of one of them."""
+    admissible = Admissible.of(network)
+    env = MultiAgentVectorEnv(network, num_envs=8)
+    env.reset(seed=seed)
+    rng = np.random.default_rng(seed)
+    for step in range(network.episode.horizon):
+        flow = env.advance(rng.choice([-1.0, 1.0], (len(env.actuators.control_rows), 8))).flow
+        size = 1e-9 * flow.sum()
+        for split in network.splits:
+            arcs = [*split.controlled_arcs, *split.other_arcs]
+            total = flow[arcs].sum(axis=0)
+            low, high = admissible.setting[:, step, arcs, None] * total
+            assert ((flow[arcs] >= low - size) & (flow[arcs] <= high + size)).all()
 
 
 def test_the_bound_says_that_contents_are_taken_for_granted() -> None:

@@ -47,6 +47,11 @@ class ComponentNetwork(StagedNetwork):
         return self.originals.get(id_, id_)
 
 
+def copy_id(id_: str, substance: str) -> str:
+    """Return what the copy of a node or an arc for a substance is called, as no part of a lifetime is."""
+    return f"{id_}:{substance}"
+
+
 def component_network(network: StagedNetwork) -> StagedNetwork:
     """Return a network with a copy for each of its substances; without substances it is as it is."""
     if not network.substances:
@@ -64,7 +69,7 @@ def component_network(network: StagedNetwork) -> StagedNetwork:
     for substance in (substance.id for substance in network.substances):
 
         def name(id_: str, substance: str = substance) -> str:
-            return f"{id_}.{substance}"
+            return copy_id(id_, substance)
 
         for nodes, copies in ((stores, all_stores), (stockless, all_stockless)):
             copies += [replace(node, id=name(node.id)) for node in nodes]

@@ -13,6 +13,7 @@ segment sum treat each column alike, so a column's bits do not depend on the bat
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping
 from typing import Annotated
 
@@ -143,7 +144,7 @@ class ArcRates:
         network, episode = self.staged_network, self.staged_network.episode
         fastest = float(self.turnover.max(initial=0.0))
         if episode.solver != "euler" and len(self.turnover):
-            node = network.nodes[int(self.turnover.argmax())].id.partition(".")[0]
+            node = re.split("[.:]", network.nodes[int(self.turnover.argmax())].id)[0]
             subject = f"network '{network.name}': node '{node}' turns over {fastest:.4g}/{network.time_unit}"
             if fastest * episode.control_interval > MAX_STEPS * MAX_TURNOVER:
                 raise CirlError(

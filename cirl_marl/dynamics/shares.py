@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cirl_marl.dynamics.components import ComponentNetwork
+from cirl_marl.dynamics.components import ComponentNetwork, copy_id
 from cirl_marl.dynamics.uncertain_factors import ControlFactors, RowFactors
 from cirl_marl.network import Floats, Integers, Network, RowSum
 from cirl_marl.network.elements import Law
@@ -26,7 +26,7 @@ def _numbers_of_shares(network: Network, ranges: Mapping[str, tuple[float, float
         for original in network.arcs[: len(network.arcs) // (1 + len(network.substances))]:
             factors = transfers if substance in dict(original.transfer) else numbers
             if original.law is Law.SHARE and original.id in factors:
-                of_arcs[network.arc_index[f"{original.id}.{substance}"]] = factors[original.id]
+                of_arcs[network.arc_index[copy_id(original.id, substance)]] = factors[original.id]
     return of_arcs
 
 

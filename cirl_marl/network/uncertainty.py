@@ -168,16 +168,19 @@ def _split_problems(network: Specification) -> Iterator[str]:
     """Yield donors whose shares some draws of their controls spoil."""
     ranges = {path: spread.ends for path, spread in network.uncertain.items() if not list(spread.problems())}
     highest = {id_: [*ranges.values()][row][1] for id_, row in numbers_of(ranges, "arcs", "control").items()}
-    divisions = splits(network)
-    if any(list(split.problems()) for split in divisions):
-        return  # which is told elsewhere
-    for split in divisions:
-        factors = np.array([[highest.get(network.arcs[k].id, 1.0)] for k in split.controlled_arcs])
-        most = float((split.bounds[1] * factors).sum(axis=0).max(initial=0.0)) if len(factors) else 0.0
-        if (factors != 1).any() and most > 1 + ROUNDING:
-            yield f"node '{split.donor}': some draws of its neutral shares sum to {most:.4g}, more than 1; give ranges"
-            return
-    yield from trap_problems(network, widest_splits(network, ranges))
+    for substance in ("", *separated_substances(network)):
+        of_substance = network_of_substance(network, substance) if substance else network
+        divisions, subject = splits(of_substance), f"substance '{substance}': " if substance else ""
+        if any(list(split.problems()) for split in divisions):
+            return  # which is told elsewhere
+        for split in divisions:
+            factors = np.array([[highest.get(network.arcs[k].id, 1.0)] for k in split.controlled_arcs])
+            most = float((split.bounds[1] * factors).sum(axis=0).max(initial=0.0)) if len(factors) else 0.0
+            if (factors != 1).any() and most > 1 + ROUNDING:
+                fault = f"some draws of its neutral shares sum to {most:.4g}, more than 1; give ranges"
+                yield f"{subject}node '{split.donor}': {fault}"
+                return
+        yield from (f"{subject}{fault}" for fault in trap_problems(of_substance, widest_splits(of_substance, ranges)))
 
 
 def _undrawable(network: Specification, part: Any, name: str, path: str) -> Iterator[str]:
@@ -366,9 +369,10 @@ def _times(network: Specification, value: Value, factor: float, most: float = ma
 def widest_splits(network: Specification, ranges: Mapping[str, tuple[float, float]]) -> list[Split]:
     """Return the splits of a network, with shares that controls set as low and as high as they can be drawn."""
     numbers, ends = numbers_of(ranges, "arcs", "control"), [*ranges.values()]
-    divisions = []
+    divisions, originals = [], getattr(network, "originals", {})  # copies for substances are drawn with their originals
     for split in splits(network):
         ids = [network.arcs[k].id for k in split.controlled_arcs]
+        ids = [originals.get(id_, id_) for id_ in ids]
         if numbers.keys() & set(ids):
             drawn = [ends[numbers[id_]] if id_ in numbers else CERTAIN for id_ in ids]
             low, high = np.array(drawn, dtype=float).T[..., None]

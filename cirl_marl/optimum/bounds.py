@@ -26,6 +26,7 @@ from cirl_marl.optimum.options import (
     by_stage,
     check_options,
     check_service,
+    contents_caveat,
     demanded_levels,
     levels_text,
     starting_stocks,
@@ -95,8 +96,7 @@ class Bound:
         agents = self.agents or self.network.agents
         idle = [arc.id for arc in self.network.arcs if arc.makes_up_for and arc.id not in agents]
         caveat = f"; {', '.join(idle)} may supply any amount within bounds in it" if idle else ""
-        if contents := [service.id for service in self.network.services if service.substance]:
-            caveat += f"; it takes {', '.join(contents)} for granted, as it does not follow contents"
+        caveat += contents_caveat(self.network)
         return f"{subject}: {statement}; its plan promises {plan}{caveat}"
 
     @property

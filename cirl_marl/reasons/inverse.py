@@ -160,7 +160,8 @@ def infer(
     stop = time.process_time() + seconds
     network = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
     if contents := [service.id for service in network.services if service.substance]:
-        raise CirlError(f"infer: programs are of masses, not of contents, of which {', '.join(contents)} are")
+        fault = f"programs are of masses, not of contents, of which {', '.join(contents)} are"
+        raise CirlError(f"network '{network.name}': infer: {fault}")
     sources = [plans] if isinstance(plans, str | Path | PlannedEpisode) else list(plans)
     if not sources:
         raise CirlError("infer: no plans were given")

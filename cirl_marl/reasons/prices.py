@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.elements import Arc, Control, Node
+from cirl_marl.network.elements import Arc, Node
 from cirl_marl.network.series import in_intervals
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.bounds import Bound, bound, highest_service
@@ -157,7 +157,7 @@ def with_bound(network: Network, agent: str, side: int, values: Floats) -> Netwo
     bounds[1] = np.clip(bounds[1], bounds[0], bounds[2])
     interval = network.episode.control_interval
     low, neutral, high = (in_intervals(series, interval) for series in bounds)
-    control = Control(kind=compartment.control.kind, low=low, neutral=neutral, high=high)
+    control = replace(compartment.control, low=low, neutral=neutral, high=high)
     variant = replace(compartment, control=control)
     nodes = tuple(variant if node.id == agent else node for node in network.nodes)
     arcs = tuple(variant if arc.id == agent else arc for arc in network.arcs)

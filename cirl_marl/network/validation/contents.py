@@ -6,10 +6,12 @@ from collections.abc import Iterator
 from typing import Any
 
 from cirl_marl.errors import unknown_name
+from cirl_marl.network.declarations import bound_problems
 from cirl_marl.network.elements import Arc, ControlKind, Law, Node
 from cirl_marl.network.specification import Specification
 from cirl_marl.network.split_fractions import SUMS
 from cirl_marl.network.substances import REMAINDER
+from cirl_marl.network.validation.settings import repetitions
 
 
 def substance_problems(network: Specification) -> Iterator[str]:
@@ -17,6 +19,8 @@ def substance_problems(network: Specification) -> Iterator[str]:
     substances = [substance.id for substance in network.substances]
     if REMAINDER in substances:
         yield f"substance '{REMAINDER}': the id is that of what is no substance; choose another"
+    for substance in network.substances:
+        yield from bound_problems(substance, f"substance '{substance.id}': ")
     for node in network.nodes:
         if node.content:
             yield from _content_problems(node, substances)
@@ -53,6 +57,7 @@ def _transfer_problems(arc: Arc, substances: list[str]) -> Iterator[str]:
         for id_ in ids:
             if id_ not in substances:
                 yield f"{subject}: {key}: {unknown_name('substance', id_, substances)}"
+    yield from repetitions(f"{subject}: control.substances", controlled)
     for id_ in dict(arc.transfer):
         if id_ in controlled:
             yield f"{subject}: transfer.{id_}: its control sets it; leave it out"

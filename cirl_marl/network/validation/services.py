@@ -14,7 +14,7 @@ from cirl_marl.network.declarations import bound_problems
 from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Node, Service
 from cirl_marl.network.series import extremes
 from cirl_marl.network.specification import Specification
-from cirl_marl.network.split_fractions import SUMS
+from cirl_marl.network.split_fractions import LEAST, SUMS
 from cirl_marl.network.validation.settings import repetitions
 
 
@@ -98,7 +98,9 @@ def supply_problems(network: Specification) -> Iterator[str]:
     suppliers: dict[str, list[Arc]] = {}
     stockless_exits: dict[str, list[Arc]] = {node.id: [] for node in network.nodes if not node.stores}
     for arc in network.arcs:
-        stockless_exits.get(arc.donor, []).append(arc)
+        # supplies follow what is no substance
+        if not network.substances or arc.control is not None or arc.share is None or extremes(arc.share)[1] > LEAST:
+            stockless_exits.get(arc.donor, []).append(arc)
     for arc in network.arcs:
         subject, kind = f"arc '{arc.id}'", arc.control.kind if arc.control else None
         if not arc.makes_up_for:
