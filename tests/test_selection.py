@@ -296,9 +296,10 @@ def test_a_price_that_moves_is_kept(tmp_path: Path) -> None:
     resumed = resume(run.path, steps=STEPS + 12)
     assert resumed.env.circularity_weight <= kept
     assert resumed._multiplier is not None and resumed._multiplier._least == pytest.approx(1.0)
-    (run.checkpoint / "price.json").write_text("{}")
-    with pytest.raises(RunError, match=r"price\.json: cannot be read: .* it holds the price of service"):
-        resume(run.path, steps=2 * STEPS)
+    for state in ({}, {**told, "service_factors": [1e300]}, {**told, "service_factors": [1.1]}):
+        (run.checkpoint / "price.json").write_text(json.dumps(state))
+        with pytest.raises(RunError, match=r"price\.json: cannot be read: .* it holds the price of service"):
+            resume(run.path, steps=2 * STEPS)
 
 
 def test_a_price_needs_what_it_needs(tmp_path: Path) -> None:

@@ -390,6 +390,20 @@ def test_shares_of_the_whole_may_change_within_an_interval() -> None:
     assert env.physical.circularity[0] <= bound(network).objective + 1e-9
 
 
+def test_networks_without_arcs_have_derivatives() -> None:
+    """Of stocks that nothing moves the levels, contents among them, are what they are, and derivatives are 0."""
+    nodes = tuple(Node(id=name, initial=(1.0, 1.0), content={"copper": 0.1}) for name in ("a", "b"))
+    service = Service(id="pure", provider="a", quantity="stock", substance="copper", low=0.0, high=0.05)
+    network = Network(name="still", nodes=nodes, arcs=(), services=(service,), substances=COPPER)
+    env = MultiAgentVectorEnv(network, num_envs=2, horizon=2)
+    env.reset(seed=0)
+    slopes = gradient(env, np.zeros((2, 0, 2)), levels=1.0)
+    np.testing.assert_allclose(slopes.levels, 0.5)
+    # of level 0.05/content: more copper lowers it, more of all else raises it
+    rows = dict(zip(env.rows.start_names, slopes.start[:, 0].tolist(), strict=True))
+    assert rows["a.copper"] == pytest.approx(-4.5, rel=1e-9) and rows["a.remainder"] == pytest.approx(0.5, rel=1e-9)
+
+
 def with_content(network: Network, **content: float) -> Network:
     """Return a network whose first stock has this content."""
     return replace(network, nodes=(replace(network.nodes[0], content=content), *network.nodes[1:]))

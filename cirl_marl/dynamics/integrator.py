@@ -163,7 +163,7 @@ class Dynamics(FlowLaws):
         parts = np.zeros((components, len(self.staged_network.arcs) // components, whole.shape[1]))
         parts[:, :arcs] = whole
         if substances is not None:
-            parts[1:, :arcs] += substances.reshape(components - 1, arcs, -1)
+            parts[1:, :arcs] += substances.reshape(components - 1, arcs, whole.shape[1])
         return parts.reshape(-1, whole.shape[1])
 
     def rate_within_capacities(

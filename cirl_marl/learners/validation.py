@@ -220,9 +220,15 @@ class Multipliers:
             integrals = np.broadcast_to(np.array(state["lasting_price"], dtype=np.float64), count).copy()
             if not (0.0 <= weight <= 1.0 and (np.isfinite(integrals) & (integrals >= 0.0)).all()):
                 raise ValueError(f"a weight of {weight} and prices of {integrals.tolist()}")
+            if np.max(factors, initial=0.0) > 1.0:
+                raise ValueError(f"factors of {factors}, of which the dearest is 1")
             self._env.service_factors = factors
             if self._budgets:
-                self._env.account_charges = state["account_charges"]
+                charges = np.array(state["account_charges"], dtype=np.float64)
+                highest = charges_of(self._env, self._budgets, np.full(len(self._budgets), LARGEST_MULTIPLIER))
+                if (np.abs(charges - self._base_charges) > highest * (1 + 1e-9)).any():
+                    raise ValueError(f"charges of {charges.tolist()}, of which none is beyond {highest.tolist()}")
+                self._env.account_charges = charges
                 integrals_of_budgets = np.array(state["lasting_budget_price"], dtype=np.float64)
                 self._budget_integrals = np.broadcast_to(integrals_of_budgets, len(self._budgets)).copy()
         except (CirlError, KeyError, TypeError, ValueError) as error:
