@@ -355,7 +355,7 @@ def test_mpc_keeps_budgets() -> None:
     assert -1e-4 <= found.gap(run.episode_circularity)[0] < 0.01
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_learners_keep_budgets(tmp_path: Path) -> None:
     """By prices that move: independent policies by exact gradients have the service and stay within the budget."""
     network = city().with_options(episode={"horizon": 60})
@@ -393,7 +393,7 @@ def test_budgets_of_learners_that_cannot_be_meant_are_refused() -> None:
     assert charged.batch.account_charges[0] == 1e-6
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_what_a_plan_books_beyond_its_program_the_next_one_has_less_of() -> None:
     """On a network whose plans are carried out a little otherwise; without it the budget is exceeded by 0.06 %."""
     run = rollout(MultiAgentVectorEnv("steel_japan", num_envs=1), MPC(min_service=0.99, at_most={"emissions": 2860.0}))
@@ -509,6 +509,7 @@ def test_plans_at_different_prices_are_compared_at_the_higher(monkeypatch: pytes
     assert plans[0].merit > plans[1].merit and chosen.value == -1.0
 
 
+@pytest.mark.slow
 def test_mpc_in_a_disturbed_network_charges_for_budgets() -> None:
     """It books less than without one, at about the service."""
     network = city().with_options(episode={"horizon": 60})

@@ -217,6 +217,26 @@ def test_draws_of_releases_are_those_of_all_components() -> None:
     np.testing.assert_allclose(env.rows.substances(env.physical.stock)[0], 2 * left, rtol=1e-12)
 
 
+def test_draws_of_a_control_leave_what_is_separated() -> None:
+    """Where an uncertain control sets the share of all else, other arcs keep that of copper, drawn networks too."""
+    network = sorting_line()
+    scrapping, recovery, rejects = network.arcs
+    control = Control(kind=ControlKind.SHARE, low=0.05, neutral=0.1, high=0.2)
+    left = Arc(id="left", donor="shredder", recipient="waste", law=Law.SHARE, share=0.3)
+    arcs = (scrapping, recovery, replace(rejects, share=None, control=control, transfer={"copper": 0.5}), left)
+    spread = Spread(low=0.6, high=1.4, distribution="uniform")
+    network = replace(network, arcs=arcs, uncertain={"arcs.rejects.control": spread})
+    env = MultiAgentVectorEnv(network, num_envs=1, uncertain=True)
+    env.reset(seed=4)
+    certain = env.certain_network(0)
+    env.advance(np.array([[0.5]]))
+    alone = MultiAgentVectorEnv(certain, num_envs=1)
+    alone.reset(seed=4)
+    alone.advance(np.array([[0.5]]))
+    np.testing.assert_allclose(alone.physical.stock, env.physical.stock, rtol=1e-12)
+    assert env.rows.substances(env.physical.stock)[2, 0] == pytest.approx(0.5 + 0.3, rel=1e-12)
+
+
 def test_draws_without_a_rest_sum_to_one() -> None:
     """Where every arc states its share of a substance, what was drawn is scaled to a whole."""
     network = sorting_line()
@@ -623,7 +643,7 @@ def test_the_bound_says_that_contents_are_taken_for_granted() -> None:
         MPC(min_service=0.99).start(env, 0)
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_sorting_lets_more_scrap_into_steel(tmp_path: Path) -> None:
     """The plan of the example keeps masses and contents; whose sorter stays as it is has less circularity."""
     limit = bound(EXAMPLE, min_service=0.99, degree=1)

@@ -311,7 +311,11 @@ def draw_network(network: Any, factors: Sequence[float] = (), path: Floats | Non
 
 
 def _drawn_shares(network: Any, drawn_arc: Callable[[int], Any]) -> Iterator[tuple[int, str, Any]]:
-    """Yield the shares of arcs, by number and field, of splits of which something was drawn, as parts of a whole."""
+    """Yield the shares of arcs, by number and field, of splits of which something was drawn, as parts of a whole.
+
+    Where the share of all else changes, substances that a node separates keep theirs, which is then stated.
+    """
+    changed = set[int]()
     for substance in ("", *separated_substances(network)):
         of_substance = network_of_substance(network, substance) if substance else network
         field = f"transfer.{substance}" if substance else "share"
@@ -324,13 +328,16 @@ def _drawn_shares(network: Any, drawn_arc: Callable[[int], Any]) -> Iterator[tup
             parts = [*(arc.share for arc in free), *(arc.control for arc in controlled)]
             before = [of_substance.arcs[k].share for k in split.other_arcs]
             before += [of_substance.arcs[k].control for k in split.controlled_arcs]
-            if parts == before or (substance and not separates(network, split)):
+            if parts == before and changed.isdisjoint(split.other_arcs):
+                continue
+            if substance and not separates(network, split):
                 continue
             shares = np.array([network.interval_means(np.nan if arc.share is None else arc.share) for arc in free])
             remainder = 1.0 - split.bounds[1].sum(axis=0)
             left = 1.0 - sum((network.interval_means(arc.control.neutral) for arc in controlled), 0.0 * remainder)
             for k, arc, share in zip(split.other_arcs, free, proportions(shares, remainder) * left, strict=True):
                 if arc.share is not None:
+                    changed.add(k)
                     yield k, field, in_intervals(share, network.episode.control_interval)
 
 
