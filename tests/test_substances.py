@@ -36,11 +36,13 @@ from cirl_marl import (
     simulate_plan,
 )
 from cirl_marl.definitions.writer import definition_of
+from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network.elements import FIXED_LIFETIME, Lifetime
 from cirl_marl.network.series import extremes
 from cirl_marl.network.uncertainty import Spread
 from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.linearised import jacobians, step_program
 
 substances_networks = st.builds(
     lambda seed, nodes, arcs, lifetimes: with_substances(random_network(seed, nodes, arcs, lifetimes=lifetimes), seed),
@@ -659,3 +661,62 @@ def test_sorting_lets_more_scrap_into_steel(tmp_path: Path) -> None:
     place = header.index("copper in scrap (1)")
     assert rows[0][place] is None
     assert 0.001 < float(str(rows[1][place])) < 0.004
+
+
+def blending(low: float, high: float = np.inf) -> Network:
+    """Return a blend of rich and poor ore, of which rich ore is mined for, that has to have a grade."""
+    flow = Control(kind=ControlKind.FLOW, low=0.0, neutral=5.0, high=10.0)
+    mines = (("rich", 0.10), ("poor", 0.02))
+    return Network(
+        name="blending",
+        nodes=(
+            *(
+                Node(id=n, initial=(100.0, 100.0), content={"copper": part}, role=Role.NONRENEWABLE_RESERVOIR)
+                for n, part in mines
+            ),
+            Node(id="blend", stores=False),
+            Node(id="smelter", initial=(0.0, 0.0)),
+        ),
+        arcs=(
+            *(Arc(id=f"of_{n}", donor=n, recipient="blend", law=Law.CONTROLLED, control=flow) for n, _ in mines),
+            Arc(id="feed", donor="blend", recipient="smelter", law=Law.SHARE),
+        ),
+        services=(
+            Service(id="mass", provider="feed", quantity="flow", low=10.0),
+            Service(id="grade", provider="feed", quantity="flow", substance="copper", low=low, high=high),
+        ),
+        accounts=(Account(id="cost", unit="EUR_2023"),),
+        substances=COPPER,
+        episode=Episode(control_interval=1.0, horizon=2),
+    )
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "costs", "rich"),
+    [(0.06, np.inf, (1.0, 0.5), 5.0), (0.06, 0.07, (1.0, 0.5), 5.0), (0.0, 0.05, (-1.0, 2.0), 3.75)],
+)
+def test_plans_keep_grades(low: float, high: float, costs: tuple[float, float], rich: float) -> None:
+    """Of 10 t with at least 6 % copper half is of 10 %, if that is dear; of at most 5 %, if it is cheap, 3.75 t."""
+    network = blending(low, high)
+    arcs = [replace(arc, accounts={"cost": cost}) for arc, cost in zip(network.arcs[:2], costs, strict=True)]
+    solution = bound(replace(network, arcs=(*arcs, network.arcs[2])), aim="cost", min_service=1.0)
+    run = simulate_plan(improve_plan(solution))
+    assert run.episode_levels.min() >= 1 - 2e-4
+    np.testing.assert_allclose(run.flow[:, 0], rich, rtol=2e-3)
+    assert run.accounts[0, 0] >= -solution.objective - 1e-9
+
+
+def test_corrections_of_steps_leave_contents_out() -> None:
+    """What an episode was away from its program is told of masses, which steps read, not of contents."""
+    solution = bound(blending(0.06), min_service=1.0)
+    solution = replace(solution, actions=np.zeros_like(solution.actions))  # 5 t of each, just what is asked for
+    dynamics, run = Dynamics(solution.network), simulate_plan(solution)
+    slopes, services = jacobians(solution, dynamics), len(solution.network.services)
+    program = step_program(solution, dynamics, run, np.ones(services), np.ones(services), 0.5, slopes)
+    values = np.zeros(len(program.scale))
+    values[program.action] = 0.1
+    trial = simulate_plan(replace(solution, actions=np.clip(solution.actions - 0.4, -1.0, 1.0)))
+    corrected, rows = program.with_correction(values, run, trial), program.measured[:, 1]
+    change = corrected.problem.under_to[: len(rows)] - program.problem.under_to[: len(rows)]
+    assert (change[rows == 1] == 0).all() and (change[rows == 0] != 0).all()
+    assert (rows == 1).any() and (rows == 0).any()

@@ -94,7 +94,8 @@ def style_axes(axes: Axes, *, title: str = "", ylabel: str = "", size: float = 9
 
 def draw_steps(axes: Axes, steps: Floats, colours: Sequence[str], notes: Sequence[str], *, start: float = 0.0) -> None:
     """Draw a waterfall: a bar for each step, one below the other from 1 on, each from where the one above it ends."""
-    ends, span = start + np.cumsum(steps), np.ptp(np.append(start + np.cumsum(steps), start)) or 1.0
+    ends = start + np.cumsum(steps)
+    span = np.ptp(np.append(ends, start)) or 1.0
     axes.plot([start, start], [0, 1], color=NEUTRAL, linewidth=0.8)
     for place, (end, step, colour, note) in enumerate(zip(ends, steps, colours, notes, strict=True), 1):
         axes.barh(place, step, left=end - step, height=0.62, color=colour)

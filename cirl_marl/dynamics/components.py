@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from types import MappingProxyType
 
 from cirl_marl.dynamics.stages import StagedNetwork, staged_network
@@ -67,10 +67,7 @@ def component_network(network: StagedNetwork) -> StagedNetwork:
         "parts": dict(network.parts),
     }
     for substance in (substance.id for substance in network.substances):
-
-        def name(id_: str, substance: str = substance) -> str:
-            return copy_id(id_, substance)
-
+        name = partial(copy_id, substance=substance)
         for nodes, copies in ((stores, all_stores), (stockless, all_stockless)):
             copies += [replace(node, id=name(node.id)) for node in nodes]
         arcs += [_arc_copy(arc, substance, name) for arc in network.arcs]

@@ -10,7 +10,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from cirl_marl.dynamics.components import ComponentNetwork
 from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import ControlKind, Law
@@ -170,14 +169,13 @@ class FlowFactors:
         rates, flows = numbers_of(ranges, "arcs", "rate"), numbers_of(ranges, "arcs", "flow")
         releases, stretches = numbers_of(ranges, "nodes", "rate"), numbers_of(ranges, "nodes", "stretch")
         entries: list[tuple[int, int, bool]] = []
-        originals = network.originals if isinstance(network, ComponentNetwork) else {}
         for k, arc in enumerate(network.arcs):
             if arc.donor in valves:
                 number = stretches.get(valves[arc.donor])
             elif arc.law is Law.SHARE:
-                number = releases.get(originals.get(arc.donor, arc.donor))
+                number = releases.get(network.original(arc.donor))
             else:
-                number = (flows if arc.law is Law.EXOGENOUS else rates).get(originals.get(arc.id, arc.id))
+                number = (flows if arc.law is Law.EXOGENOUS else rates).get(network.original(arc.id))
             if number is not None:
                 entries.append((k, number, arc.donor in valves))
         self.arcs: Integers = np.array([k for k, _, _ in entries], dtype=np.intp)

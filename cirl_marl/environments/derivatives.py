@@ -94,12 +94,11 @@ class Derivatives:
             by_flow += bookings[0]
             by_start = bookings[1] / 2
             by_stock = by_stock + by_start
-        by_content = env.substances_adjoint(by_quantity[signals.substances]) if network.substances else (None, None)
-        stock = adjoint.stock + env.rows.masses_adjoint(by_stock, by_content[0])
+        by_substance, by_its_flow = env.substance_masses.pull_back(by_quantity[signals.substances])
+        stock = adjoint.stock + env.rows.masses_adjoint(by_stock, by_substance)
         inputs = IntervalInputs(before.stock, interval.controls, factors)
         length = network.episode.control_interval
-        moved, substances = by_flow / length, None if by_content[1] is None else by_content[1] / length
-        result = self._supply.pull_back(inputs, step, env.idle, stock, moved, substances)
+        result = self._supply.pull_back(inputs, step, env.idle, stock, by_flow / length, by_its_flow / length)
         actions, ends = env.actuators.pull_back(interval.actions, step, factors, result.controls)
         draws = np.zeros_like(before.factors)
         if factors is not None and factor_adjoint is not None and result.factors is not None:

@@ -24,6 +24,7 @@ from cirl_marl.environments.observations import ObservationLayout
 from cirl_marl.environments.rewards import Credit, Scoring
 from cirl_marl.environments.starts import Starts
 from cirl_marl.environments.state import Interval, Outcome, Snapshot, State
+from cirl_marl.environments.substance_masses import SubstanceMasses
 from cirl_marl.errors import CirlError, ControlError, unknown_name, whole_number
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.calendar import years
@@ -71,6 +72,7 @@ class MultiAgentVectorEnv:
         actuators: from actions to controls.
         idle: which arcs of ``supply`` nobody acts on.
         ledger: what is booked on accounts.
+        substance_masses: what substances there are in stocks and flows.
         supply: the arcs that make up for services.
         controls: their values in the last interval, in the rows of ``network.control_rows``, (controls, num_envs).
         state_names: nodes, ``compartment.state`` of the inner states, ``arc.row`` of the masses of batch arcs, and
@@ -150,6 +152,7 @@ class MultiAgentVectorEnv:
         self.observation_names = self.layout.names
         self._starts = Starts(variant, self.dynamics, num_envs, self.layout.array_order)
         self.rows = self.dynamics.rows
+        self.substance_masses = SubstanceMasses(variant, self.rows)
         self.state_names = (*self.rows.start_names, *self.rows.batch_names, *variant.processes.state_names)
         self.episodes: Integers = np.zeros(num_envs, dtype=np.intp)
         self.controls: Floats = np.empty((len(self.dynamics.neutral), num_envs))
@@ -576,10 +579,8 @@ class MultiAgentVectorEnv:
             quantities[signals.states] = transition.inner
             quantities[signals.measures] = dynamics.inner.measures(transition.inner, controls)
             quantities[signals.loads] = dynamics.batches.loads(transition.stock)
-        if self.network.substances:
-            quantities[signals.substances] = self._substances(
-                transition.stock, transition.moved_substances / self.network.episode.control_interval
-            )
+        substances = transition.moved_substances / self.network.episode.control_interval
+        quantities[signals.substances] = self.substance_masses(transition.stock, substances)
         flow.flags.writeable = False  # infos hand it out, and the state keeps it
         return quantities, flow
 
@@ -587,28 +588,9 @@ class MultiAgentVectorEnv:
         """Return the quantities of a state, in the rows of ``layout.signals``, shape (quantities, B)."""
         loads = self.dynamics.batches.loads(state.stock)
         through = self.network.throughput(state.flow)
-        parts = [self.rows.stocks(state.stock), through, state.flow, state.inner, state.measures, loads]
-        if self.network.substances:
-            parts.append(self._substances(state.stock, state.substances))
-        return np.concatenate(parts)
-
-    def _substances(self, masses: Floats, flow: Floats) -> Floats:
-        """Return the mass of each substance in stocks, throughputs and flows, in the rows of ``signals.substances``."""
-        batch, count = masses.shape[1], len(self.network.substances)
-        stocks, flows = (part.reshape(count, -1, batch) for part in (self.rows.substances(masses), flow))
-        through = self.network.throughput(np.moveaxis(flows, 0, 1)).swapaxes(0, 1)
-        return np.concatenate([stocks, through, flows], axis=1).reshape(-1, batch)
-
-    def substances_adjoint(self, adjoint: Floats) -> tuple[Floats, Floats]:
-        """Return derivatives by the masses of substances in stocks and by their flows of those by the quantities.
-
-        Shapes are (substances · stores, B) and (substances · arcs, B); of what is given (rows of
-        ``signals.substances``, B).
-        """
-        batch, stores, nodes = adjoint.shape[1], len(self.network.stores), len(self.network.nodes)
-        parts = adjoint.reshape(len(self.network.substances), -1, batch)
-        flows = [self.network.throughput_adjoint(part[stores:nodes]) + part[nodes:] for part in parts]
-        return parts[:, :stores].reshape(-1, batch), np.concatenate(flows)
+        substances = self.substance_masses(state.stock, state.substances)
+        stocks = self.rows.stocks(state.stock)
+        return np.concatenate([stocks, through, state.flow, state.inner, state.measures, loads, substances])
 
     def observe_into(self, table: Floats) -> Floats:
         """Return the stacked observation by way of ``table``, of its precision (``ObservationLayout.observe``)."""

@@ -514,7 +514,6 @@ class Substance(CheckedRecord):
     """
 
     id: str
-    title: Annotated[str, TITLE] = ""
     scale: Annotated[float, Positive("reference content of observations, a part of the mass")] = 1.0
 
 

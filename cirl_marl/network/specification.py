@@ -81,6 +81,10 @@ class Specification:
         """What loads it again: its definition file, with the region if there is one; empty if it has no file."""
         return "" if self.source is None else ":".join(filter(None, (str(self.source), self.region)))
 
+    def original(self, id_: str) -> str:
+        """Return the compartment that one stands for: itself, unless it is the copy of one for a substance."""
+        return id_
+
     def interval_means(self, value: Value) -> Floats:
         """Return a value in each control interval, its mean over the interval, shape (horizon,)."""
         horizon = self.episode.horizon

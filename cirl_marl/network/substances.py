@@ -51,7 +51,8 @@ def contents(network: Specification, node: Node) -> list[float]:
     """Return the parts of a node's initial stock: what is no substance, then each substance; they sum to 1."""
     content: dict[str, Any] = dict(node.content)
     parts = [float(content.get(substance.id, 0.0)) for substance in network.substances]
-    return [max(1.0 - sum(parts), 0.0), *parts]
+    whole = max(sum(parts), 1.0)  # of sums of decimals, which round
+    return [max(1.0 - sum(parts), 0.0), *(part / whole for part in parts)]
 
 
 def separation_problems(network: Specification) -> Iterator[str]:

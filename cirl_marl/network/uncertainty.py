@@ -376,10 +376,9 @@ def _times(network: Specification, value: Value, factor: float, most: float = ma
 def widest_splits(network: Specification, ranges: Mapping[str, tuple[float, float]]) -> list[Split]:
     """Return the splits of a network, with shares that controls set as low and as high as they can be drawn."""
     numbers, ends = numbers_of(ranges, "arcs", "control"), [*ranges.values()]
-    divisions, originals = [], getattr(network, "originals", {})  # copies for substances are drawn with their originals
+    divisions = []
     for split in splits(network):
-        ids = [network.arcs[k].id for k in split.controlled_arcs]
-        ids = [originals.get(id_, id_) for id_ in ids]
+        ids = [network.original(network.arcs[k].id) for k in split.controlled_arcs]
         if numbers.keys() & set(ids):
             drawn = [ends[numbers[id_]] if id_ in numbers else CERTAIN for id_ in ids]
             low, high = np.array(drawn, dtype=float).T[..., None]

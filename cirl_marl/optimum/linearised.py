@@ -6,6 +6,7 @@ are difference quotients of the simulator, so that cuts of flows and supplies th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Annotated
@@ -160,11 +161,15 @@ def step_program(
         # low·level − δq ≤ q; −δx ≤ x; and ±(φ + δφ) ≤ imbalance, with q, x and φ those of the simulated episode
         table, limit, own = -by_stage @ response, by_stage @ state[t], np.zeros((len(measure), size))
         own[np.arange(services), level + np.arange(services)] = low[:, t]
-        for s, part, whole, most in contents:
-            # level·part ≤ most·whole, to first order: part·level + level₀·δpart − most·δwhole ≤ most·whole
-            share, mass = run.levels[0, s, t], float(part @ state[t])
-            table[s] = (share * part - most[t] * whole) @ response
-            limit[s], own[s, level + s] = most[t] * float(whole @ state[t]), mass
+        for s, part, whole, least, most in contents:
+            share, mass, total = run.levels[0, s, t], float(part @ state[t]), float(whole @ state[t])
+            if math.isfinite(most[t]) and mass >= least[t] * total:
+                # level·part ≤ most·whole, to first order: part·level + level₀·δpart − most·δwhole ≤ most·whole
+                table[s] = (share * part - most[t] * whole) @ response
+                limit[s], own[s, level + s] = most[t] * total, mass
+            else:  # level·least·whole ≤ part
+                table[s] = (share * least[t] * whole - part) @ response
+                limit[s], own[s, level + s] = mass, least[t] * total
         is_near = abs(table) @ furthest[: t + 1].ravel() > limit - own.sum(axis=1)
         if is_absolute:
             own[-2:, imbalance], is_near[-2:] = -1.0, True
@@ -260,10 +265,10 @@ def _measures(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats, Floats]
     return measure, by_stage, imbalances
 
 
-def _contents(bound: Bound, dynamics: Dynamics) -> list[tuple[int, Floats, Floats, Floats]]:
-    """Return each service of a content: its number, what reads its substance and its whole, and its upper end.
+def _contents(bound: Bound, dynamics: Dynamics) -> list[tuple[int, Floats, Floats, Floats, Floats]]:
+    """Return each service of a content: its number, what reads its substance and its whole, and the ends of its band.
 
-    Both read the rows of Jacobians, shape (rows,); the upper end has shape (steps,).
+    Both read the rows of Jacobians, shape (rows,); the ends have shape (steps,).
     """
     network, rows, arcs = bound.network, dynamics.rows, len(bound.network.arcs)
     stocks, contents = rows.nodes.stop, []
@@ -280,7 +285,7 @@ def _contents(bound: Bound, dynamics: Dynamics) -> list[tuple[int, Floats, Float
         else:
             columns = stocks + network.service_arcs(service)
             part[columns + number * arcs], whole[columns] = 1.0, 1.0
-        contents.append((s, part, whole, network.interval_means(service.high)))
+        contents.append((s, part, whole, network.interval_means(service.low), network.interval_means(service.high)))
     return contents
 
 

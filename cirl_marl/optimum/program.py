@@ -123,7 +123,7 @@ class Programs:
             chain_form = Admissible.of(lifetimes.reach_network, admissible.agents) if has_lifetimes else admissible
             system = ComparisonSystem(chain_form, cache)
         self.system = system
-        # where nodes separate substances the shares of the whole change with its content
+        # where nodes separate substances shares of the whole follow its content, which schedules change in substeps
         separates = bool(separated_substances(admissible.network))
         constant_shares = constant_shares and not (hold_controls or separates) and layout is None
         self._transit: Transit | None = None

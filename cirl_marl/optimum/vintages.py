@@ -24,7 +24,7 @@ from typing import Annotated, Any
 import numpy as np
 from scipy import sparse
 
-from cirl_marl.dynamics.components import ComponentNetwork, simulated_network
+from cirl_marl.dynamics.components import simulated_network
 from cirl_marl.dynamics.laws import ArcRates
 from cirl_marl.dynamics.stages import StagedNetwork, staged_network
 from cirl_marl.dynamics.state_layout import StateLayout
@@ -293,13 +293,13 @@ def _column_sums(columns: Integers, width: int) -> Any:
 def _sums(fine: Network, coarse: Network) -> Any:
     """Return what the nodes of one writing of a network are of those of another that is written out further."""
     stages = fine.stages if isinstance(fine, StagedNetwork) else {}
-    copies: dict[str, list[str]] = {}
-    for copy_, original in (fine.originals if isinstance(fine, ComponentNetwork) else {}).items():
-        copies.setdefault(original, []).append(copy_)
+    components: dict[str, list[str]] = {}
+    for node in fine.nodes:
+        components.setdefault(fine.original(node.id), []).append(node.id)
     whole = coarse.stages if isinstance(coarse, StagedNetwork) else {}
     sums = sparse.lil_array((len(coarse.nodes), len(fine.nodes)))
     for i, node in enumerate(coarse.nodes):
         for part in (node.id,) if len(whole.get(node.id, ())) > 1 else stages.get(node.id, (node.id,)):
-            for component in (part, *copies.get(part, ())):
+            for component in components[part]:
                 sums[i, fine.node_index[component]] = 1.0
     return sparse.csr_array(sums)
