@@ -87,6 +87,33 @@ def booked(network: Network, seed: int, *, credits: bool = True) -> Network:
     return replace(network, nodes=nodes, arcs=arcs, accounts=ACCOUNTS, scenarios={})
 
 
+def with_lambda(network: Network) -> Network:
+    """Return a network with an account of what moves finite-time sustainably: −λ̄·T/Δ if nothing is absolute."""
+    signs = zip(network.arcs, network.sustainability.tolist(), strict=True)
+    arcs = tuple(replace(arc, accounts={"moved": sign}) for arc, sign in signs)
+    return replace(network, arcs=arcs, accounts=(Account(id="moved", unit=network.mass_unit),), scenarios={})
+
+
+def city() -> Network:
+    """Return the paper cycle of a city in which recycled fibre is cheaper than virgin one, and emits more."""
+    network = load_network("paper_city")
+    costs = {"virgin_fibre": 600.0, "collection": 40.0, "feed": 90.0, "bales_to_mill": 15.0}
+    emissions = {"virgin_fibre": 0.2, "feed": 0.6, "bales_to_mill": 0.5}
+    arcs = tuple(
+        replace(
+            arc,
+            accounts={
+                **({"cost": costs[arc.id]} if arc.id in costs else {}),
+                **({"emissions": emissions[arc.id]} if arc.id in emissions else {}),
+            },
+        )
+        for arc in network.arcs
+    )
+    nodes = tuple(replace(n, holding={"cost": 0.5}) if n.id in ("hall", "bales") else n for n in network.nodes)
+    parts: dict[str, Any] = {"arcs": arcs, "nodes": nodes, "services": network.services[:1], "accounts": ACCOUNTS}
+    return replace(network, name="city", scenarios={}, **parts)
+
+
 NO_STATES = np.empty((0, 1))
 
 

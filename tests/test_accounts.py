@@ -1,12 +1,10 @@
-"""Money, emissions and energy beside mass: what is booked, bounds and plans for it, budgets, files and messages."""
+"""Money, emissions and energy beside mass: what is booked, bounds and plans for it, tables, files and messages."""
 
 from __future__ import annotations
 
 import csv
-import json
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, get_type_hints
 
 import numpy as np
@@ -16,8 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from small_networks import ACCOUNTS, booked, plain_networks, small
-from test_capacities import power
+from small_networks import ACCOUNTS, booked, city, plain_networks, small, with_lambda
 from test_optimum import bounded, certifiable, pinned
 from typer.testing import CliRunner
 
@@ -33,75 +30,35 @@ from cirl_marl import (
     Node,
     Role,
     Series,
-    Trained,
-    account_front,
     compare,
     gradient,
     levers,
     load_network,
-    load_recipe,
     mo_parallel_env,
     parallel_env,
     plan,
     simulate,
-    train,
     write_network,
 )
 from cirl_marl.cli import app
 from cirl_marl.controllers import Neutral, Random
 from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.drawing.style import draw_steps, number
-from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.dynamics.ledger import Ledger
 from cirl_marl.evaluation.compared_quantities import rank_quantities
 from cirl_marl.evaluation.episode_count import concatenation
 from cirl_marl.evaluation.sampling import sample_episodes, sensitivities
-from cirl_marl.evaluation.simulations import Simulation, simulate_alternatives
-from cirl_marl.network.disturbances import AutoRegression, DisturbanceEffect, Markov
+from cirl_marl.evaluation.simulations import simulate_alternatives
+from cirl_marl.network.disturbances import DisturbanceEffect, Markov
 from cirl_marl.network.uncertainty import Spread, network_of_intervals
 from cirl_marl.network.units import factor
-from cirl_marl.optimum import bound, improve, improve_plan, simulate_plan, smooth, smooth_plan
-from cirl_marl.optimum.aims import Aims, Budget
-from cirl_marl.optimum.linearised import jacobians, step_program
-from cirl_marl.optimum.program import Programs
-from cirl_marl.optimum.solver import Basis
-from cirl_marl.optimum.window_planner import WindowPlanner
-from cirl_marl.optimum.windows import WindowPlan, WindowTask
+from cirl_marl.optimum import bound, simulate_plan
 from cirl_marl.report.account_tables import account_steps, accounts_table, save_accounts
-from cirl_marl.report.data_package import read_package, write_package
-from cirl_marl.report.iamc import read_iamc, write_iamc
 from cirl_marl.report.lever_chart import levers_table, write_levers
 from cirl_marl.report.page_data import page_data
 from cirl_marl.report.report_page import page_of_alternatives
 from cirl_marl.report.samples import write_samples
 from cirl_marl.report.tradeoffs import summary_of
-
-
-def with_lambda(network: Network) -> Network:
-    """Return a network with an account of what moves finite-time sustainably: −λ̄·T/Δ if nothing is absolute."""
-    signs = zip(network.arcs, network.sustainability.tolist(), strict=True)
-    arcs = tuple(replace(arc, accounts={"moved": sign}) for arc, sign in signs)
-    return replace(network, arcs=arcs, accounts=(Account(id="moved", unit=network.mass_unit),), scenarios={})
-
-
-def city() -> Network:
-    """Return the paper cycle of a city in which recycled fibre is cheaper than virgin one, and emits more."""
-    network = load_network("paper_city")
-    costs = {"virgin_fibre": 600.0, "collection": 40.0, "feed": 90.0, "bales_to_mill": 15.0}
-    emissions = {"virgin_fibre": 0.2, "feed": 0.6, "bales_to_mill": 0.5}
-    arcs = tuple(
-        replace(
-            arc,
-            accounts={
-                **({"cost": costs[arc.id]} if arc.id in costs else {}),
-                **({"emissions": emissions[arc.id]} if arc.id in emissions else {}),
-            },
-        )
-        for arc in network.arcs
-    )
-    nodes = tuple(replace(n, holding={"cost": 0.5}) if n.id in ("hall", "bales") else n for n in network.nodes)
-    parts: dict[str, Any] = {"arcs": arcs, "nodes": nodes, "services": network.services[:1], "accounts": ACCOUNTS}
-    return replace(network, name="city", scenarios={}, **parts)
 
 
 def test_what_decays_books_what_left_and_what_was_held() -> None:
@@ -233,43 +190,6 @@ def test_no_episode_books_less_than_the_bound(network: Network, interval: float,
     assert (run.episode_circularity[kept] <= best.objective + 1e-9 * scale).all()
 
 
-def test_budgets_are_kept_at_a_price_between_the_difference_quotients() -> None:
-    """The multiplier of a budget of carbon is its price, within 1 % of quotients of solved programs."""
-    network = city().with_options(episode={"horizon": 30})
-    free = bound(network, min_service=0.95)
-    least = bound(network, aim="emissions", min_service=0.95)
-    budget = float(0.5 * (free.accounts[1] - least.objective))
-    assert free.accounts[1] > budget > -least.objective
-    for aim in ("circularity", "cost"):
-        solved = bound(network, aim=aim, min_service=0.95, at_most={"emissions": budget})
-        step = 1e-3 * budget
-        lower, higher = (
-            bound(network, aim=aim, min_service=0.95, at_most={"emissions": budget + way * step}).objective
-            for way in (-1, 1)
-        )
-        price, quotients = (
-            solved.budget_prices["emissions"],
-            sorted([solved.objective - lower, higher - solved.objective]),
-        )
-        assert 0.99 * quotients[0] / step <= price <= 1.01 * quotients[1] / step
-        assert solved.accounts[1] <= budget * (1 + 1e-6)
-        run = simulate_plan(smooth_plan(improve_plan(solved)))
-        assert run.accounts[0, 1] <= budget * (1 + 1e-4)
-        assert run.episode_levels.min() >= 0.95 - 1e-4
-        assert solved.gap(solved.aims.value(run)) <= 0.01
-
-
-def test_large_plans_keep_budgets(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Plans without Jacobians tighten a budget by what was booked too much."""
-    monkeypatch.setattr(improve, "MOST_SLOPES", 0)
-    network = city()
-    least = -bound(network, aim="emissions", min_service=0.9).objective
-    solved = bound(network, min_service=0.9, at_most={"emissions": 1.1 * least})
-    run = simulate_plan(improve_plan(solved))
-    assert run.accounts[0, 1] <= 1.1 * least * (1 + 1e-3)
-    assert solved.gap(solved.aims.value(run)) <= 0.02
-
-
 def test_what_cannot_be_asked_for_is_told() -> None:
     """Budgets out of reach, alone or together, unknown accounts, two aims at once."""
     network = city()
@@ -315,215 +235,6 @@ def test_what_cannot_be_asked_for_is_told() -> None:
         with pytest.raises(CirlError, match=words):
             bound(network, **wrong)
     assert bound(network, aim={"circularity": 1.0}, service_weight=1.0).aims.is_circular
-
-
-def halfway(network: Network) -> float:
-    """Return emissions between the least and those of the best plan, at a service of 0.95."""
-    free, least = (bound(network, aim=aim, min_service=0.95).accounts[1] for aim in ("circularity", "emissions"))
-    return float(free + least) / 2
-
-
-def test_weights_are_prices_of_budgets() -> None:
-    """Who pays the price of a budget per unit has the optimum of who keeps it, but for what the budget is worth."""
-    network = city()
-    kept = bound(network, min_service=0.95, at_most={"emissions": (most := halfway(network))})
-    price = kept.budget_prices["emissions"]
-    assert price > 0
-    paid = bound(network, min_service=0.95, aim={"circularity": 1.0, "emissions": price})
-    assert paid.objective == pytest.approx(kept.objective - price * most, rel=1e-6)
-    assert f"1·λ̄ {-price:+g}·emissions ≤" in str(paid)
-    run = simulate_plan(improve_plan(paid))
-    short = max(0.95 - float(run.episode_levels.min()), 0.0)
-    assert 0 <= short < 1e-3
-    assert paid.aims.value(run) <= float(paid.at(min_service=0.95 - short)) + 1e-9 * abs(paid.objective)
-    assert paid.aims.value(run) == pytest.approx(paid.objective, rel=0.01)
-    dearer = bound(network, min_service=0.95, aim={"cost": 1.0, "emissions": 2e3})
-    assert dearer.objective == pytest.approx(-dearer.accounts @ [1.0, 2e3], rel=1e-6)
-
-
-def test_mpc_keeps_budgets() -> None:
-    """With the service and close to the λ̄ of the bound from the same start; stocks book too."""
-    network = city()
-    stores = [replace(node, holding={"emissions": 0.05}) if node.stores else node for node in network.nodes]
-    network = replace(network, nodes=tuple(stores))
-    most = halfway(network)
-    env = MultiAgentVectorEnv(network, num_envs=1)
-    run = rollout(env, MPC(min_service=0.95, at_most={"emissions": most}))
-    found = bound(network, run.start, min_service=0.95, at_most={"emissions": most})
-    assert run.accounts[0, 1] <= most * (1 + 1e-5)
-    assert run.episode_levels.min() >= 0.95 - 2e-3
-    assert -1e-4 <= found.gap(run.episode_circularity)[0] < 0.01
-
-
-@pytest.mark.slow
-def test_learners_keep_budgets(tmp_path: Path) -> None:
-    """By prices that move: independent policies by exact gradients have the service and stay within the budget."""
-    network = city().with_options(episode={"horizon": 60})
-    most, given = halfway(network), load_recipe("exact_gradients")
-    run = given.run.model_copy(update={"min_service": 0.95, "at_most": {"emissions": most}})
-    train(network, given.model_copy(update={"run": run}), steps=300_000, seed=2, directory=tmp_path / "run")
-    played = rollout(MultiAgentVectorEnv(network, num_envs=16), Trained(tmp_path / "run"), seed=7)
-    found = bound(network, min_service=0.95, at_most={"emissions": most})
-    assert played.accounts[:, 1].mean() < most * 1.01
-    assert played.episode_levels.mean() > 0.95 - 5e-3
-    assert played.episode_circularity.mean() > found.objective - 0.05 * abs(found.objective)
-
-
-def test_budgets_of_learners_that_cannot_be_meant_are_refused() -> None:
-    """Without a demanded service, of no account, or charged for in a reward without λ."""
-    network, given = city(), load_recipe("exact_gradients")
-    for changes, message in (
-        ({"min_service": None, "price_rate": 0.0, "at_most": {"cost": 1.0}}, "run.at_most: budgets are kept beside"),
-        ({"at_most": {"cots": 1.0}}, "at_most: unknown account 'cots'.*Did you mean 'cost'"),
-    ):
-        wrong = given.model_copy(update={"run": given.run.model_copy(update=changes)})
-        with pytest.raises(CirlError, match=message):
-            train(network, wrong, steps=1000)
-    with pytest.raises(CirlError, match=r"charges: unknown account 'cots'.*Did you mean 'cost'"):
-        MultiAgentVectorEnv(network, num_envs=1, charges={"cots": 1.0})
-    with pytest.raises(CirlError, match="charges count in rewards with λ, not in 'local'"):
-        MultiAgentVectorEnv(network, num_envs=1, reward="local", charges={"cost": 1.0})
-    wrong_charges: list[tuple[Any, str]] = [({"cost": "x"}, "that of 'cost' must be a number")]
-    for charges, message in (*wrong_charges, (["cost"], "give {account: number}")):
-        with pytest.raises(CirlError, match=f"charges: {message}"):
-            MultiAgentVectorEnv(network, num_envs=1, charges=charges)
-    with pytest.raises(CirlError, match="charges must be finite numbers"):
-        MultiAgentVectorEnv(network, num_envs=1, charges={"cost": float("nan")})
-    charged = parallel_env(network, reward="team", charges={"cost": 1e-6}).unwrapped
-    assert charged.batch.account_charges[0] == 1e-6
-
-
-@pytest.mark.slow
-def test_what_a_plan_books_beyond_its_program_the_next_one_has_less_of() -> None:
-    """On a network whose plans are carried out a little otherwise; without it the budget is exceeded by 0.06 %."""
-    run = rollout(MultiAgentVectorEnv("steel_japan", num_envs=1), MPC(min_service=0.99, at_most={"emissions": 2860.0}))
-    assert run.accounts[0, 0] <= 2860.0 * (1 + 2e-5)
-    assert run.episode_levels.min() >= 0.99 - 2e-3
-
-
-def test_budgets_out_of_reach_are_approached_and_said() -> None:
-    """Zero of what costs something: nothing is done, and what is missing is told."""
-    network, control = power(6), MPC(min_service=0.5, at_most={"cost": 0.0})
-    run = rollout(MultiAgentVectorEnv(network, num_envs=1), control)
-    assert run.accounts[0, 0] == pytest.approx(0.0, abs=1e-6)
-    assert "this one has 0.5000 less of 'demand'" in control.note
-    tight = MPC(min_service=1.0, at_most={"cost": 1.02 * bound(power(8), aim="cost", min_service=1.0).accounts[0]})
-    run = rollout(MultiAgentVectorEnv(power(8), num_envs=1), tight)
-    assert not tight.note and run.episode_levels.min() > 1 - 1e-6
-
-
-def test_a_budget_of_nothing_has_a_price() -> None:
-    """Plans beside it get better; its price is no infinity."""
-    network = power(6)
-    arcs = [replace(arc, accounts={"cost": -400.0}) if arc.id == "use" else arc for arc in network.arcs]
-    network = replace(network, arcs=tuple(arcs), objective=replace(network.objective, circularity_scale=100.0))
-    found = bound(network, at_most={"cost": 0.0}, min_service=0.5)
-    assert np.isfinite(improve.prices(found)).all()
-    assert simulate_plan(improve_plan(found)).accounts[0, 0] <= 1e-6
-
-
-@pytest.mark.medium
-def test_a_plan_is_not_left_for_a_worse_one() -> None:
-    """Where no plan is within the budget, what is done in the end takes no more than the first plan did, or nearly."""
-    free = rollout(MultiAgentVectorEnv("steel_japan", num_envs=1, horizon=8), MPC(min_service=0.95))
-    control = MPC(min_service=0.95, at_most={"emissions": 0.93 * float(free.accounts[0, 0])})
-    run = rollout(MultiAgentVectorEnv("steel_japan", num_envs=1, horizon=8), control)
-    assert run.accounts[0, 0] <= free.accounts[0, 0] * (1 + 1e-6)
-
-
-def test_plans_are_compared_by_what_they_exceed() -> None:
-    """At the price of a budget; and charges on what is booked are no part of the objective that is left."""
-    network = city().with_options(episode={"horizon": 30})
-    least = -bound(network, aim="emissions", min_service=0.95).objective
-    control = MPC(min_service=0.95, at_most={"emissions": 0.8 * least})
-    plan = first_window(control, network)
-    assert "less of 'paper_delivered'" in control.note
-    merit, booked_parts = control._planner._merit, plan.bookings.sum(axis=0)
-    assert plan.merit == pytest.approx(merit(plan, plan.task.price))
-    over = replace(plan, task=replace(plan.task, limits=booked_parts - 0.05))
-    merits = [merit(over, np.array([factor, 0.0])) for factor in (0.0, 1.0, 3.0)]
-    np.testing.assert_allclose(np.diff(merits), [-0.05, -0.1])
-    assert merits[0] == plan.value
-    future = control._planner.futures[0]
-    charged = replace(plan.task, charges=np.array([50.0]))
-    values = [future.carry_out(task, plan.actions)[2] for task in (plan.task, charged)]
-    assert values[0] - values[1] == pytest.approx(50.0 * float(plan.bookings.sum()))
-
-
-def first_window(control: MPC, network: Network) -> WindowPlan:
-    """Return the first plan of the first copy."""
-    env = MultiAgentVectorEnv(network, num_envs=1)
-    env.reset(seed=0)
-    control.start(env, 0)
-    plan = control._plans[0].window
-    assert plan is not None
-    return plan
-
-
-def test_the_rest_of_a_plan_stays_where_a_new_one_is_worse() -> None:
-    """And is left for one that is better, at the price of what either exceeds."""
-    network = city().with_options(episode={"horizon": 30})
-    control = MPC(min_service=0.95, at_most={"emissions": halfway(network)})
-    plan = first_window(control, network)
-    idle = np.full_like(plan.actions, -1.0)
-    level, bookings, value = control._planner.futures[0].carry_out(plan.task, idle)
-    worse = replace(plan, actions=idle, level=np.minimum(level, 1.0).mean(axis=0), bookings=bookings, value=value)
-    assert (control._planner.better_of(worse, plan).actions == plan.actions).all()
-    assert control._planner.better_of(plan, worse) is plan
-
-
-@pytest.mark.parametrize("changes", [True, False])
-def test_budgets_ask_for_further_rounds(monkeypatch: pytest.MonkeyPatch, changes: bool) -> None:
-    """As long as what is booked beyond the program changes, ten programs are solved where plans keep little of it."""
-    trial, rounds = WindowPlanner._trial, list[int]()
-
-    def erring(planner: WindowPlanner, task: WindowTask, basis: Basis | None, rises: int = 8) -> WindowPlan:
-        plan = trial(planner, task, basis, rises)
-        rounds.append(len(rounds))
-        more = 0.001 * len(rounds) if changes else 0.001
-        parts = [replace(part, error=0 * part.error, excess=0 * part.excess + more) for part in plan.corrections]
-        return replace(plan, value=plan.value - 1e6, merit=plan.merit - 1e6, corrections=tuple(parts))
-
-    monkeypatch.setattr(WindowPlanner, "_trial", erring)
-    network = city().with_options(episode={"horizon": 6})
-    first_window(MPC(min_service=0.5, at_most={"emissions": 1e3}), network)
-    assert len(rounds) == (10 if changes else 2)
-
-
-def test_plans_at_different_prices_are_compared_at_the_higher(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A first one that exceeds its budget a little at a low price is no better than a second that keeps it."""
-    trial, plans = WindowPlanner._trial, list[WindowPlan]()
-
-    def told(planner: WindowPlanner, task: WindowTask, basis: Basis | None, rises: int = 8) -> WindowPlan:
-        plan, is_first = trial(planner, task, basis, rises), not plans
-        price = np.array([1.0, 1.0]) if is_first else np.array([100.0, 1.0])
-        bookings = np.zeros_like(plan.bookings)
-        bookings[0] = task.limits + (0.1 if is_first else 0.0)
-        reached: dict[str, Any] = {"bookings": bookings, "level": np.ones(1), "value": 0.0 if is_first else -1.0}
-        plan = replace(plan, task=replace(plan.task, price=price), **reached)
-        plans.append(replace(plan, merit=planner._merit(plan, price)))
-        return plans[-1]
-
-    monkeypatch.setattr(WindowPlanner, "_trial", told)
-    chosen = first_window(MPC(min_service=0.5, at_most={"emissions": 1e3}), city().with_options(episode={"horizon": 6}))
-    assert plans[0].merit > plans[1].merit and chosen.value == -1.0
-
-
-@pytest.mark.slow
-def test_mpc_in_a_disturbed_network_charges_for_budgets() -> None:
-    """It books less than without one, at about the service."""
-    network = city().with_options(episode={"horizon": 60})
-    most, path = halfway(network), f"services.{network.services[0].id}.low"
-    disturbances = {"demand": AutoRegression(deviation=0.3, persistence=0.8, low=0.5, high=1.6)}
-    network = replace(network, disturbances=disturbances, disturbed={path: DisturbanceEffect(by="demand")})
-    booked_emissions = {}
-    for futures in (None, 2):
-        for budget in (None, {"emissions": most}):
-            env = MultiAgentVectorEnv(network, num_envs=4)
-            run = rollout(env, MPC(futures=futures, min_service=0.95, at_most=budget))
-            booked_emissions[budget is None] = float(run.accounts[:, 1].mean())
-            assert run.episode_levels.mean() > 0.95 - 0.01
-        assert booked_emissions[False] < 0.85 * booked_emissions[True]
 
 
 @pytest.mark.parametrize(
@@ -708,35 +419,6 @@ def test_pictures_show_who_books_what_and_the_total(tmp_path: Path, monkeypatch:
     assert "discounted" in waterfall.get_title("left") and "discounted" not in idle.get_title("left")
 
 
-@pytest.mark.slow
-def test_the_front_of_two_aims_is_proved_and_reached(tmp_path: Path) -> None:
-    """Plans lie on the worse side of the front and near it; prices are its slope; both have a hypervolume."""
-    file = tmp_path / "city.toml"
-    write_network(city(), file)
-    for axes in (("circularity", "emissions"), ("cost", "emissions")):
-        front = account_front(file, axes, min_service=0.9, points=4)
-        at_plans = front.at(front.plans[:, 1])
-        assert (front.sign * (at_plans - front.plans[:, 0]) >= -1e-5 * abs(at_plans)).all()
-        np.testing.assert_allclose(front.at(front.budgets), front.bounds, rtol=1e-4)
-        assert (np.diff(front.prices) <= 1e-6 * front.prices[0]).all() and front.prices[0] > 0
-        assert (front.plans[:, 1] <= front.budgets * (1 + 1e-4)).all() and (front.levels <= 1).all()
-        proved, achieved = front.volumes
-        assert 0.99 * proved <= achieved <= proved * (1 + 1e-5)
-        assert replace(front, shortages=np.ones(4)).volumes == (proved, 0.0)
-    out = ["--min-service", "0.9", "--points", "3", "--out", str(tmp_path / "front")]
-    result = CliRunner().invoke(app, ["pareto", str(file), "--between", "cost,emissions", *out])
-    assert result.exit_code == 0, result.output
-    with (tmp_path / "front" / "pareto.csv").open(encoding="utf-8") as lines:
-        assert len(list(csv.reader(lines))) == 4
-    assert (tmp_path / "front" / "pareto.png").stat().st_size > 1000
-    with pytest.raises(CirlError, match="then another account"):
-        account_front(file, ("cost", "circularity"), min_service=0.9)
-    with pytest.raises(CirlError, match="nothing to weigh"):
-        account_front(with_lambda(load_network("paper_city")), ("circularity", "moved"), min_service=0.9)
-    with pytest.raises(CirlError, match="nothing to weigh"):  # less ore is less of both
-        account_front("copper_world", ("circularity", "emissions"), min_service=1.0)
-
-
 @pytest.mark.parametrize(
     ("name", "least", "most"),
     [("steel_world", 3300.0, 3800.0), ("aluminium_world", 900.0, 1150.0), ("copper_world", 87.0, 110.0)],
@@ -764,78 +446,6 @@ def test_copies_and_intervals_keep_what_is_booked() -> None:
     for rates, others in zip(*(Ledger(each).rates() for each in undiscounted), strict=True):
         np.testing.assert_allclose(rates[:, ::-1], others)
     assert any(isinstance(rate, Series) for arc in network.arcs for rate in dict(arc.accounts).values())
-
-
-def test_multipliers_of_a_budget_hold_at_other_starts() -> None:
-    """``Bound.at`` takes the aim and the budgets along: it proves no less than a program of that start."""
-    network = city()
-    least = -bound(network, aim="emissions", min_service=0.9).objective
-    solved = bound(network, min_service=0.9, at_most={"emissions": 1.5 * least})
-    for aim, found in (("circularity", solved), ("cost", bound(network, aim="cost", min_service=0.9))):
-        start = found.initial * np.array([1.0, 1.1, 0.9, 1.2, 1.0])
-        budgets = {"emissions": 1.5 * least} if found is solved else None
-        own = bound(network, start, aim=aim, min_service=0.9, at_most=budgets)
-        proved = float(found.at(start))
-        assert own.objective - 1e-6 * abs(own.objective) <= proved <= own.objective + 0.2 * abs(own.objective)
-        assert float(found.at()) == pytest.approx(found.objective, rel=1e-9)
-
-
-def test_a_step_of_a_plan_knows_what_it_books() -> None:
-    """To first order the program of a step has the account that is kept low, and the budget, as the simulator does."""
-    network = city()
-    # so that what is held counts as much as what flows
-    nodes = tuple(replace(n, holding={"cost": 5.0}) if n.holding else n for n in network.nodes)
-    network = replace(network, nodes=nodes)
-    solved = bound(network, aim="cost", min_service=0.9, at_most={"emissions": 3000.0})
-    rng, dynamics = np.random.default_rng(0), Dynamics(network)
-    middle = replace(solved, actions=rng.uniform(-0.5, 0.5, solved.actions.shape))
-    run = simulate_plan(middle)
-    program = step_program(middle, dynamics, run, np.array([0.9]), np.ones(2), 0.1, jacobians(middle, dynamics))
-    moves = np.zeros(len(program.origin))
-    moves[program.action] = 1e-4 * rng.uniform(-1, 1, program.action.shape)
-    trial = simulate_plan(replace(middle, actions=middle.actions + moves[program.action]))
-    books = trial.accounts[0] - run.accounts[0]
-    row = program.problem.under[[len(program.problem.under_to) - 1]].toarray()[0]
-    assert program.problem.cost @ moves == pytest.approx(books[0], rel=1e-3)
-    assert row @ moves == pytest.approx(books[1], rel=1e-3)
-    assert program.problem.under_to[-1] == pytest.approx(3000.0 - run.accounts[0, 1])
-    moves *= 3000.0
-    trial = simulate_plan(replace(middle, actions=np.clip(middle.actions + moves[program.action], -1.0, 1.0)))
-    corrected = program.with_correction(moves, run, trial)
-    assert corrected.problem.under_to[-1] == pytest.approx(3000.0 - trial.accounts[0, 1] + row @ moves, rel=1e-9)
-
-
-def test_what_exceeds_a_budget_is_charged_and_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Plans over their budget are worth less; the next program of a large network has that much less to spend."""
-    network = city()
-    solved = bound(network, min_service=0.9, at_most={"emissions": 3000.0})
-    run = simulate_plan(solved)
-    tight = replace(
-        solved, aims=replace(solved.aims, budgets=(Budget(1, float(run.accounts[0, 1]) - 100.0, "emissions"),))
-    )
-    rates = np.array([0.0, 2.0])
-    values = [improve.penalised_objective(plan, run, rates) for plan in (solved, tight)]
-    assert values[1] == pytest.approx(float(run.episode_circularity[0]) - 200.0)
-    assert values[0] >= values[1] + 199.0
-    assert improve.shortage(tight, run) == pytest.approx(100.0 / (float(run.accounts[0, 1]) - 100.0), rel=1e-6)
-    good: Any = SimpleNamespace(run=run, bound=solved)
-    bad: Any = SimpleNamespace(run=_with_more(run, 1.01), bound=solved)
-    assert smooth._as_good(good, good) and not smooth._as_good(bad, good)
-    budgets: list[float] = []
-    program = Programs.program
-
-    def recorded(self: Programs, initial: Any, min_service: Any = None, **options: Any) -> Any:
-        budgets.append(options["aims"].limits[0])
-        return program(self, initial, min_service, **options)
-
-    monkeypatch.setattr(Programs, "program", recorded)
-    monkeypatch.setattr(Aims, "excess", lambda self, run: np.array([5.0]))
-    improve.refine(solved)
-    assert budgets == [2995.0, 2990.0]
-
-
-def _with_more(run: Rollout, factor: float) -> Rollout:
-    return replace(run, accounts=np.maximum(run.accounts, 3000.0) * factor)
 
 
 def test_gradients_by_uncertain_and_disturbed_prices() -> None:
@@ -908,177 +518,6 @@ def test_levers_tell_what_they_add_to_accounts(tmp_path: Path) -> None:
     assert any("emissions, alone" in str(column.header) for column in levers_table(found).columns)
 
 
-def test_years_go_to_the_format_of_scenario_databases(tmp_path: Path) -> None:
-    """Every stock, flow and amount stands there to the last digit, under its region; parts add up to the account."""
-    world, japan = simulate("steel_world", steps=2), simulate("steel_japan", steps=2)
-    with write_iamc(tmp_path / "iamc.csv", [world, japan]).open(encoding="utf-8") as lines:
-        rows = list(csv.DictReader(lines))
-    keys = [(row["Scenario"], row["Region"], row["Variable"]) for row in rows]
-    assert len(set(keys[: -_size(japan)])) == len(keys) - _size(japan)
-    table = {(row["Region"], row["Variable"]): row for row in rows[: -_size(japan)]}
-    network, run = world.network, world.rollout
-    made = table["japan", "Flow|pig_iron_made"]
-    assert made["Unit"] == "kt/yr" and made["Model"].startswith("cirl_marl ")
-    assert [float(made[year]) for year in ("2025", "2026")] == run.flow[
-        :, network.arc_index["japan_pig_iron_made"]
-    ].tolist()
-    total = [float(table["World", "Greenhouse gases"][year]) for year in ("2025", "2026")]
-    parts = [row for (_, variable), row in table.items() if variable.startswith("Greenhouse gases|")]
-    assert {row["Region"] for row in parts} >= {"japan", "china"}
-    np.testing.assert_allclose([sum(float(row[year]) for row in parts) for year in ("2025", "2026")], total, rtol=1e-9)
-    assert rows[-1]["Region"] == "japan" and total == run.bookings[0, 0].tolist()
-    with pytest.raises(CirlError, match="IAMC has calendar years; give"):
-        write_iamc(tmp_path / "no.csv", [simulate(city(), steps=2)])
-    with pytest.raises(CirlError, match="Circularity would come 2 times; give other titles"):
-        write_iamc(tmp_path / "no.csv", [japan, japan])
-    with pytest.raises(CirlError, match="give at least one episode"):
-        write_iamc(tmp_path / "no.csv", [])
-    with pytest.raises(CirlError, match="no such file"):
-        read_iamc(tmp_path / "no.csv")
-    with pytest.raises(CirlError, match="different years"):
-        write_iamc(tmp_path / "no.csv", [japan, simulate("steel_japan", steps=3)])
-
-
-def test_years_come_back_from_files_of_scenario_databases(tmp_path: Path) -> None:
-    """What was written, to the last digit; empty cells are missing; what is wrong is named with its line."""
-    japan = simulate("steel_japan", steps=3)
-    path = write_iamc(tmp_path / "iamc.csv", [japan])
-    rows = {row.variable: row for row in read_iamc(path)}
-    assert len(rows) == _size(japan)
-    pig_iron = rows["Flow|pig_iron_made"]
-    flow = japan.rollout.flow[:, japan.network.arc_index["pig_iron_made"]]
-    assert pig_iron.values == dict(zip((2025, 2026, 2027), flow.tolist(), strict=True)) and pig_iron.unit == "kt/yr"
-    head = "Model,Scenario,Region,Variable,Unit,2025,2030\n"
-    path.write_text(f"{head}m,s,World,Primary Energy,EJ/yr,,3.5\n")
-    assert [dict(row.values) for row in read_iamc(path)] == [{2030: 3.5}]
-    for text, message in (
-        (head.replace("Unit", "Units"), "unknown column 'Unit'. Did you mean 'Units'"),
-        (head.replace("2030", "notes"), "column 'notes' is no year"),
-        (head.replace("2030", "2025"), "column '2025' comes a second time"),
-        (f"{head}m,s,World,Steel,t,1,many\n", "line 2: the value of 2030 is no finite number"),
-        (f"{head}m,s,World,Steel,t,1,2\nm,s,World,Steel,kt,1,2\n", "line 3: m, s, World, Steel comes a second time"),
-    ):
-        path.write_text(text)
-        with pytest.raises(CirlError, match=message):
-            read_iamc(path)
-
-
-@pytest.mark.parametrize("name", ["city", "copper_net", "steel_japan"])
-def test_a_data_package_has_a_network_and_its_episode(tmp_path: Path, name: str) -> None:
-    """All numbers come back as they were, with a network that moves in the same way."""
-    network = city().with_options(episode={"horizon": 5}) if name == "city" else load_network(name)
-    done = simulate(network, steps=5)
-    descriptor = json.loads(write_package(tmp_path / "package", done).read_text(encoding="utf-8"))
-    assert {part["name"] for part in descriptor["resources"]} >= {"nodes", "arcs", "stocks", "flows", "accounts"}
-    back, run = read_package(tmp_path / "package"), done.rollout
-    assert (back.scenario, back.control) == ("default", "neutral")
-    np.testing.assert_array_equal(back.stock, np.concatenate([run.start[None], run.stock]))
-    np.testing.assert_array_equal(back.flow, run.flow)
-    np.testing.assert_array_equal(back.levels, run.levels[0].T)
-    np.testing.assert_array_equal(back.circularity, run.circularity_mean[0])
-    np.testing.assert_allclose(back.bookings, run.bookings[0].T, rtol=1e-12)
-    again = simulate(back.network, steps=5).rollout
-    np.testing.assert_allclose(again.flow, run.flow, rtol=1e-9, atol=1e-9 * np.abs(run.flow).max())
-    with pytest.raises(CirlError, match="package: exists; a data package is a folder of its own"):
-        write_package(tmp_path / "package", done)
-
-
-@pytest.mark.parametrize(
-    ("file", "old", "new", "message"),
-    [
-        ("flows.csv", "0,feed,", "0,fed,", "flows.csv, line .*: unknown arc 'fed'.*Did you mean 'feed'"),
-        ("flows.csv", "interval,arc,flow", "interval,arc,floww", "unknown column 'flow'.*Did you mean 'floww'"),
-        ("stocks.csv", "2,hall,", "7,hall,", "interval '7' is none of 0 to 2"),
-        ("stocks.csv", "2,hall,", "2,hall,x", "stock 'x.*' is no finite number"),
-        ("circularity.csv", "1,", "0,", "line 3: circularity of the network comes a second time"),
-        ("flows.csv", "1,feed,", "0,feed,", "flows.csv, line .*: flow of feed comes a second time"),
-        ("stocks.csv", "2,hall,", "2,hall,1\n2,bales,", "stocks.csv, line .*: stock of bales comes a second time"),
-        ("datapackage.json", '"name": "services"', '"name": "service"', "unknown table 'services'.*'service'"),
-        ("datapackage.json", '"resources"', '"resource"', "unknown table 'stocks'"),
-    ],
-)
-def test_data_packages_that_say_something_else_are_refused(
-    tmp_path: Path, file: str, old: str, new: str, message: str
-) -> None:
-    """With the file, the line, and the nearest valid name."""
-    write_package(tmp_path / "package", simulate(city(), steps=2))
-    path = tmp_path / "package" / file
-    text = path.read_text(encoding="utf-8")
-    assert old in text
-    path.write_text(text.replace(old, new, 1), encoding="utf-8")
-    with pytest.raises(CirlError, match=message):
-        read_package(tmp_path / "package")
-
-
-def test_what_nobody_books_comes_back_as_nothing(tmp_path: Path) -> None:
-    """And a table that is not there is named."""
-    network = replace(city(), accounts=(*ACCOUNTS, Account(id="idle", unit="t")))
-    write_package(tmp_path / "package", simulate(network, steps=2))
-    back = read_package(tmp_path / "package")
-    assert not back.bookings[:, 2].any() and back.bookings[:, :2].all()
-    (tmp_path / "package" / "flows.csv").unlink()
-    with pytest.raises(CirlError, match=r"flows\.csv: no such file"):
-        read_package(tmp_path / "package")
-
-
-def test_the_command_writes_a_data_package(tmp_path: Path) -> None:
-    """Of one episode; of several it says what to give."""
-    package = ["simulate", "paper_city", "--steps", "3", "--out", str(tmp_path), "--package", str(tmp_path / "data")]
-    done = CliRunner().invoke(app, package)
-    assert done.exit_code == 0 and "datapackage.json" in done.output
-    assert len(read_package(tmp_path / "data").flow) == 3
-    several = ["--control", "neutral", "--control", "random"]
-    for more, message in ((several, "holds one episode"), (["--samples", "2"], "go without --samples")):
-        refused = CliRunner().invoke(app, [*package, *more])
-        assert isinstance(refused.exception, CirlError) and message in str(refused.exception)
-
-
-def test_what_no_file_holds_is_refused_before_anything_is_simulated(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Names of files, years and titles are known before an episode is."""
-    monkeypatch.setattr("cirl_marl.evaluation.simulations.rollout", None)
-    (tmp_path / "file").touch()
-    iamc, japan, twice = str(tmp_path / "iamc.csv"), ["steel_japan"], tmp_path / "twice.toml"
-    network = load_network("steel_japan")
-    write_network(replace(network, accounts=(replace(network.accounts[0], title="Circularity"),)), twice)
-    for arguments, message in (
-        ([*japan, "--iamc", "iamc.xlsx"], "--iamc iamc.xlsx: needs the name of a .csv file"),
-        ([*japan, "--iamc", str(tmp_path / "file" / "iamc.csv")], "file is a file, not a folder"),
-        (["paper_city", "--iamc", iamc], "IAMC has calendar years; give"),
-        ([str(twice), "--iamc", iamc], "Circularity would come 2 times; give other titles"),
-        ([*japan, "--package", str(tmp_path / "file" / "data")], "file is a file, not a folder"),
-    ):
-        refused = CliRunner().invoke(app, ["simulate", *arguments, "--out", str(tmp_path)])
-        assert isinstance(refused.exception, CirlError) and message in str(refused.exception)
-    assert {path.name for path in tmp_path.iterdir()} == {"file", "twice.toml"}
-
-
-def test_the_command_writes_years_of_scenarios_and_controls(tmp_path: Path) -> None:
-    """Of as many steps as are asked for, which scenarios may differ in otherwise."""
-    path, controls = tmp_path / "iamc.csv", ["--control", "neutral", "--control", "random"]
-    options = ["--steps", "2", "--out", str(tmp_path), "--iamc", str(path)]
-    done = CliRunner().invoke(app, ["simulate", "steel_japan", *controls, *options])
-    assert done.exit_code == 0, done.output
-    rows = read_iamc(path)
-    assert {row.scenario for row in rows} == {"steel_japan default neutral", "steel_japan default random"}
-    assert {tuple(row.values) for row in rows} == {(2025, 2026)}
-    file = tmp_path / "japan.toml"
-    write_network(load_network("steel_japan"), file)
-    short = '\n[scenarios.short.episode]\nhorizon = { value = 3, unit = "1", source = "chosen" }\n'
-    file.write_text(file.read_text(encoding="utf-8") + short, encoding="utf-8")
-    done = CliRunner().invoke(app, ["simulate", str(file), "--scenario", "default", "--scenario", "short", *options])
-    assert done.exit_code == 0, done.output
-    assert {row.scenario for row in read_iamc(path)} == {"steel_japan default neutral", "steel_japan short neutral"}
-
-
-def _size(simulation: Simulation) -> int:
-    network = simulation.network
-    parts = {(simulation.env.ledger.account[e], c) for e, c in enumerate(simulation.env.ledger.compartments)}
-    figures = 1 + len(network.services) + len(network.stores) + len(network.arcs)
-    return figures + len(network.accounts) + len(parts)
-
-
 def test_small_accounts_differ_beside_large_ones() -> None:
     """Round-off is that of the account itself: what comes to a few tonnes is not lost beside what comes to billions."""
     network = city()
@@ -1088,16 +527,3 @@ def test_small_accounts_differ_beside_large_ones() -> None:
     totals = [case.rollout.accounts[0] for case in cases]
     assert np.ptp([total[1] for total in totals]) < 1e-12 * totals[0][0]
     assert ranks["emissions"] > 0
-
-
-def test_a_smoother_plan_may_book_what_the_last_one_did() -> None:
-    """Where a region is too small to keep a budget again, the program of the nearest actions has a solution."""
-    network = city().with_options(episode={"horizon": 8})
-    least = -bound(network, aim="emissions", min_service=0.9).objective
-    solved = bound(network, min_service=0.9, at_most={"emissions": 1.05 * least})
-    more = replace(solved, actions=np.clip(solved.actions + 0.2, -1.0, 1.0))
-    dynamics, distance = Dynamics(network), smooth.Distance(solved)
-    reference, centre = (smooth._Episode(plan, dynamics) for plan in (solved, more))
-    assert centre.run.accounts[0, 1] > 1.05 * least > reference.run.accounts[0, 1] * 0.999
-    margin = np.zeros_like(reference.run.levels[0])
-    assert smooth._nearer(centre, reference, dynamics, distance, 1e9, 1e-6, margin, restore=False) is not None

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from small_networks import ACCOUNTS, booked, small
-from test_accounts import city, first_window
+from small_networks import ACCOUNTS, booked, city, small
+from test_budgets import first_window
 from test_optimum import bounded, pinned
 from typer.testing import CliRunner
 
