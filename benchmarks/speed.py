@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
+from itertools import product
 from pathlib import Path
 from statistics import median
 from typing import Annotated, Any
@@ -55,6 +56,8 @@ LONE = 64
 ARCS = (10, 100, 1_000, 10_000, 100_000, 1_000_000)
 LEARNT, SEEDS = 10_240, 5
 """Environment steps of a training, two rollouts of the recipe, and seeds that learn together."""
+CROWDS = (1, 16)
+"""Seeds that learn together on an accelerator."""
 WORLDS = 256
 """Copies of the steel of the world."""
 CELLS = 1_000_000
@@ -75,6 +78,7 @@ class Measurement(StrEnum):
     WORLD = "world"
     DISTURBED = "disturbed"
     GRADIENTS = "gradients"
+    ACCELERATOR = "accelerator"
 
 
 @dataclass(frozen=True, slots=True)
@@ -434,10 +438,49 @@ def gradients() -> list[Figure]:
     return figures
 
 
+def accelerator() -> list[Figure]:
+    """Measure stacked learners and exact gradients on an accelerator against the same on one core, by the clock."""
+    if not torch.cuda.is_available():
+        return [Figure("learners on an accelerator / on one core", "", remark="no accelerator here")]
+    figures = []
+    for name, seeds in product(("independent_ppo", "exact_gradients"), CROWDS):
+        recipe = load_recipe(name)
+        recipe = recipe.model_copy(update={"run": recipe.run.model_copy(update={"evaluations": 0, "price_rate": 0.0})})
+        steps = 4 * recipe.run.envs * int(recipe.learner.parameters["n_steps"])
+        learnt: dict[str, torch.Tensor] = {}
+
+        def seconds(
+            device: str,
+            recipe: Recipe = recipe,
+            seeds: int = seeds,
+            steps: int = steps,
+            learnt: dict[str, torch.Tensor] = learnt,
+        ) -> float:
+            began = time.perf_counter()
+            trainings = train_seeds("copper_net", recipe, seeds=range(seeds), steps=steps, device=device)
+            cost = time.perf_counter() - began
+            policies = [learner.model.policy for learner in trainings[0].learners.values()]
+            learnt[device] = torch.cat(
+                [weights.detach().cpu().flatten() for each in policies for weights in each.parameters()]
+            )
+            return cost
+
+        core, chip = _interleaved(1, partial(seconds, "cpu"), partial(seconds, "cuda"))
+        ratio = median(a / b for a, b in zip(core, chip, strict=True))
+        apart = float((learnt["cpu"] - learnt["cuda"]).abs().max())
+        what = (
+            f"{name} on copper_net, {seeds} seeds, {seeds * AGENTS} learners: {torch.cuda.get_device_name()} / one core"
+        )
+        rates = " / ".join(f"{seeds * steps / median(each):,.0f}" for each in (chip, core))
+        remark = f"{rates} environment steps/s, making of learners included; weights differ by {apart:.1e} at most"
+        figures.append(Figure(what, f"{ratio:.2f} ×", remark=remark))
+    return figures
+
+
 MEASURES: dict[Measurement, Callable[[], list[Figure]]] = dict(
     zip(
         Measurement,
-        (batched, single, share, lockstep, stacked, arcs, yearly, world, disturbances, gradients),
+        (batched, single, share, lockstep, stacked, arcs, yearly, world, disturbances, gradients, accelerator),
         strict=True,
     )
 )
