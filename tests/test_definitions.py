@@ -328,6 +328,44 @@ def test_scenario_mistakes_are_all_named(tmp_path: Path) -> None:
     assert "Did you mean 'sorting'" in message
 
 
+def test_scenarios_bring_new_compartments_and_services(tmp_path: Path) -> None:
+    """What says all that it must is new; what does not is a mistake that says what a new one needs."""
+    new = """
+[scenarios.more.nodes.exporter]
+role = "technosphere"
+stores = false
+
+[scenarios.more.arcs.use_to_exporter]
+from = "use"
+to = "exporter"
+law = "donor"
+rate = { value = 0.01, unit = "1/day", source = "x" }
+
+[scenarios.more.arcs.exported]
+from = "exporter"
+to = "landfill"
+law = "share"
+share = "rest"
+
+[scenarios.more.services.exports]
+provider = "exported"
+quantity = "flow"
+low = { value = 1, unit = "kt/day", source = "x" }
+weight = { value = 1, unit = "1", source = "x" }
+"""
+    path = tmp_path / "more.toml"
+    path.write_text(COPPER + new, encoding="utf-8")
+    usual, more = load_network(path), load_network(path, scenario="more")
+    assert [node.id for node in more.nodes if node not in usual.nodes] == ["exporter"]
+    assert [arc.id for arc in more.arcs if arc not in usual.arcs] == ["use_to_exporter", "exported"]
+    assert [service.id for service in more.services] == [*(service.id for service in usual.services), "exports"]
+    for key, needs in (('role = "tech', "role"), ('from = "use"', "from and to"), ('provider = "exp', "provider")):
+        lines = [line for line in new.splitlines() if not line.startswith(key)]
+        path.write_text(COPPER + "\n".join(lines), encoding="utf-8")
+        with pytest.raises(DefinitionError, match=f"scenarios.more.*unknown.*A new one needs {needs}\\."):
+            load_network(path, scenario="more")
+
+
 def test_units_are_converted(tmp_path: Path) -> None:
     """A rate per year is a rate per day, 365.25 times smaller."""
     path = tmp_path / "yearly.toml"

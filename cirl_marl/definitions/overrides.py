@@ -9,6 +9,8 @@ from cirl_marl.errors import unknown_name
 
 COMMON_KEYS = ("name", "regions", "scenarios")
 """What is the same in every scenario."""
+WHOLE = {"nodes": ("role",), "arcs": ("from", "to"), "services": ("provider",)}
+"""What a table must say to be a new node, arc or service rather than a change of one."""
 
 
 def overlay(base: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:
@@ -69,3 +71,16 @@ def path_mistakes(document: Mapping[str, Any], paths: Any, prefix: str) -> Itera
                 yield f"{prefix}without: '{path}': {unknown_name('key', key, options)}"
                 break
             table = table[key]
+
+
+def stranger_mistakes(document: Mapping[str, Any], override: Mapping[str, Any], prefix: str) -> Iterator[str]:
+    """Yield the nodes, arcs and services that a scenario changes but ``document`` does not have."""
+    for part, keys in WHOLE.items():
+        names, changes = document.get(part, {}), override.get(part, {})
+        if not isinstance(changes, Mapping) or not isinstance(names, Mapping):
+            yield f"{prefix}{part}: must be a table"
+            continue
+        for name, change in changes.items():
+            is_new = isinstance(change, Mapping) and all(key in change for key in keys)
+            if name not in names and not is_new:
+                yield f"{prefix}{part}: {unknown_name(part[:-1], name, names)} A new one needs {' and '.join(keys)}."

@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from cirl_marl.definitions.conversion import Converter
 from cirl_marl.definitions.data_files import DataFiles
 from cirl_marl.definitions.error_messages import choices, toml_mistake, validation_mistakes
-from cirl_marl.definitions.overrides import COMMON_KEYS, overlay, path_mistakes, without_paths
+from cirl_marl.definitions.overrides import COMMON_KEYS, overlay, path_mistakes, stranger_mistakes, without_paths
 from cirl_marl.definitions.region_copies import compose_copies, copied_file
 from cirl_marl.definitions.schema import NetworkTable
 from cirl_marl.errors import CirlError, DefinitionError, NetworkError, unknown_name
@@ -85,7 +85,11 @@ class Definition:
         if (name, region) not in self._networks:
             override, prefix = self._overrides[name], "" if name == DEFAULT else f"scenarios.{name}."
             document, copies = self._whole(name)
-            mistakes = list(_strangers(document, override, prefix))
+            mistakes = [
+                *path_mistakes(document, override.get("without", []), prefix),
+                *stranger_mistakes(document, override, prefix),
+                *(f"{prefix}{key}: a scenario cannot set it" for key in COMMON_KEYS if key in override),
+            ]
             if mistakes:
                 raise DefinitionError(str(self.path), mistakes)
             fields |= {"copies": copies, "source": self.path, "source_sha256": self.sha256}
@@ -203,23 +207,6 @@ def _impossible(document: Mapping[str, Any]) -> Iterator[str]:
             entries += [(f"{path}.{key}".lstrip("."), depth + 1, entry) for key, entry in parts]
         elif isinstance(value, int) and not -(2**63) <= value < 2**63:
             yield f"{path}: is an integer of {math.floor(value.bit_length() * math.log10(2))} digits; {DIGITS}"
-
-
-def _strangers(document: Mapping[str, Any], override: Mapping[str, Any], prefix: str) -> Iterator[str]:
-    """Yield the compartments and services that a scenario names but the network does not have."""
-    yield from path_mistakes(document, override.get("without", []), prefix)
-    for table in ("nodes", "arcs", "services"):
-        names = document.get(table, {})
-        changes = override.get(table, {})
-        if not isinstance(changes, Mapping) or not isinstance(names, Mapping):
-            yield f"{prefix}{table}: must be a table"
-            continue
-        for name in changes:
-            if name not in names:
-                yield f"{prefix}{table}: {unknown_name(table[:-1], name, names)}"
-    for key in COMMON_KEYS:
-        if key in override:
-            yield f"{prefix}{key}: a scenario cannot set it"
 
 
 def _build(document: Mapping[str, Any], beside: tuple[DataFiles, str], **fields: Any) -> Network:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
 from cirl_marl.definitions.error_messages import validation_mistakes
-from cirl_marl.definitions.overrides import overlay, path_mistakes, without_paths
+from cirl_marl.definitions.overrides import overlay, path_mistakes, stranger_mistakes, without_paths
 from cirl_marl.definitions.schema import CopiesTable, CorrelationTable
 from cirl_marl.errors import NetworkError, unknown_name
 from cirl_marl.network.declarations import Kinds, Quantity, declarations
@@ -100,7 +100,7 @@ def _pattern(document: Document, original: Document, scenario: str) -> dict[str,
     for prefix, change in changes:
         still = {key: _still(value, key, removals) for key, value in change.items() if key != "without"}
         paths = [path for path in change.get("without", []) if not _in(path, removals)]
-        mistakes = [*path_mistakes(pattern, paths, prefix), *_strangers(pattern, still, prefix)]
+        mistakes = [*path_mistakes(pattern, paths, prefix), *stranger_mistakes(pattern, still, prefix)]
         if mistakes:
             raise NetworkError(of, mistakes)
         pattern = overlay(without_paths(pattern, {"without": paths}), still)
@@ -115,13 +115,6 @@ def _in(path: str, removals: set[str]) -> bool:
 def _still(value: Any, key: str, removals: set[str]) -> Any:
     """Return a table of changes less what has gone before."""
     return {id_: table for id_, table in value.items() if f"{key}.{id_}" not in removals} if key in NAME_KEYS else value
-
-
-def _strangers(pattern: Document, change: Document, prefix: str) -> Iterator[str]:
-    for part in (part for part in NAME_KEYS if part != "disturbances"):  # of which a scenario may bring new ones
-        for id_ in change.get(part, {}):
-            if id_ not in pattern.get(part, {}):
-                yield f"{prefix}{part}: {unknown_name(part[:-1], id_, pattern.get(part, {}))}"
 
 
 def _add_common(document: dict[str, Any], pattern: dict[str, Any], regions: Sequence[str]) -> None:

@@ -263,6 +263,6 @@ class NetworkTable(quantities.Table):
     )
     scenarios: dict[Identifier, dict[str, Any]] = Field(
         {},
-        description="tables that replace those of the default scenario, key by key, after those named in 'without', "
-        "such as 'nodes.digester.model', are left out",
+        description="tables that replace those of the default scenario, key by key, or add nodes, arcs and services, "
+        "after those named in 'without', such as 'nodes.digester.model', are left out",
     )
