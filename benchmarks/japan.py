@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.document import write_sections
+from benchmarks.japan_copper import copper, world
 from benchmarks.japan_decisions import decisions, levers_of
 from benchmarks.steel import PRIMARY, TABLE, calibrated, countries, populations, possible_network
 from cirl_marl import Levers, MultiAgentVectorEnv, levers, load_network
@@ -33,7 +34,7 @@ POSSIBLE = 16
 """Histories and lifetimes that the data allow, for which levers are pulled."""
 TOGETHER = {"what is exported, steel or goods": ("semis_exports", "long_exports", "flat_exports", "goods_exports")}
 """Agents of one decision: what Japan exports, whatever its form."""
-SECTIONS = ("saved", "levers", "ranges", "trade", "lives", "spread", "later")
+SECTIONS = ("saved", "levers", "ranges", "trade", "lives", "spread", "copper", "copper_world", "later")
 """Parts of the document that are measured."""
 ORE = {"ore": ("mining", "ore_imports")}
 """What makes up for what is lacking in the world without shocks, and is a decision where demand is not known."""
@@ -176,6 +177,8 @@ def main() -> None:
         "trade": trade(),
         "lives": lives(),
         "spread": spread(network),
+        "copper": copper(),
+        "copper_world": world(),
         "later": decisions(NAME, {**ORE, **TOGETHER}),
     }
     for name in sections:

@@ -1,6 +1,6 @@
 """The data of ``envs/steel.toml``, and what was measured with it; ``docs/data.md`` has the sources.
 
-python -m benchmarks.steel          # writes envs/steel.csv, steel_history, steel_regions and steel_demand anew
+python -m benchmarks.steel          # writes envs/steel.csv, steel_history, _regions, _demand and _copper anew
 python -m benchmarks.steel --plans  # kept bounds and plans of every country (benchmarks.best_plans), in docs/cycles.md
 """
 
@@ -121,6 +121,8 @@ HALVED = ("scrap_losses", "bof_losses", "eaf_losses", "long_scrap", "flat_scrap"
 """Shares that can be halved."""
 RANGES = {"scrap_to_bof": (0.5, 1.5), "scrap_exports": (0.0, 1.25)}
 """Shares that agents set, as factors on those of today."""
+RICHER = (1.0, 7.0, 20.0)
+"""Copper of long products, as a multiple of that of flat ones: melts alike; melts of electric furnaces; at the most."""
 EXPORTS = {"semis_exports": "semis_imports", "long_exports": "long_imports"} | {
     "flat_exports": "flat_imports",
     "goods_exports": "goods_imports",
@@ -313,6 +315,7 @@ class Files:
         self.write_history()
         self.write_regions()
         self.write_demand()
+        self.write_copper()
 
     def write_flows(self) -> None:
         """Write flows and shares; from 2025 on shares are those of today, and imports follow use as usual."""
@@ -381,6 +384,17 @@ class Files:
         header = ["region", "year", "population", "stock_per_head", "collection_most", *HALVED, "use"]
         header += [f"{arc}_{end}" for arc in EXPORTS for end in ("low", "neutral", "high")]
         write_table(self.folder / "steel_demand.csv", header, rows)
+
+    def write_copper(self) -> None:
+        """Write what long products get of the copper in steel, if theirs is so many times that of flat ones."""
+        rows: list[list[object]] = []
+        for country in self.countries:
+            now = today(country, self.pooled)
+            long, sold = now["semis_to_long"], float(self.known[country.name].export_shares(now)["semis_exports"].max())
+            parts = [(1 - sold) * times * long / (times * long + 1 - long - sold) for times in RICHER]
+            rows.append([country.name, *map(_said, parts)])
+        header = ["region", *(f"to_long_{end}" for end in ("low", "neutral", "high"))]
+        write_table(self.folder / "steel_copper.csv", header, rows)
 
     def simulated(self, country: Country, scenario: str = "default") -> tuple[dict[str, Floats], dict[str, Floats]]:
         """Return flows by arc and stocks by node of a country in which nobody acts."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import random
 import shutil
@@ -258,10 +259,13 @@ def with_substances(network: Network, seed: int) -> Network:
         arcs.append(arc)
     carried = {arc.id for arc in network.arcs if arc.law is Law.BATCH}
     services = [s for s in network.services if s.quantity != "stock" or carried.isdisjoint(s.providers)]
+    ends = [(0.0, 1.0), (0.6, math.inf)]  # limits of a content, and grades
     services += [
-        replace(s, id=f"{s.id}_content", substance=names[0], low=0.0, high=float(rng.uniform(0.01, 0.5)))
+        replace(s, id=f"{s.id}_content", substance=names[0], low=low * content, high=high * content)
         for s in services
         if rng.random() < 0.5
+        for content in [float(rng.uniform(0.01, 0.5))]
+        for low, high in [ends[int(rng.integers(2))]]
     ]
     substances = tuple(Substance(id=name, scale=0.1) for name in names)
     return replace(

@@ -40,7 +40,7 @@ from cirl_marl.network.elements import Role
 from cirl_marl.optimum import bound, gap, improve_plan, simulate_plan
 
 NETWORKS = families()["steel"]
-STEEL_FILES = ("steel.csv", "steel_history.csv", "steel_regions.csv", "steel_demand.csv")
+STEEL_FILES = ("steel.csv", "steel_history.csv", "steel_regions.csv", "steel_demand.csv", "steel_copper.csv")
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -40,9 +41,11 @@ from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network.elements import FIXED_LIFETIME, Lifetime
 from cirl_marl.network.series import extremes
+from cirl_marl.network.substances import follows_contents
 from cirl_marl.network.uncertainty import Spread
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.linearised import jacobians, step_program
+from cirl_marl.optimum.program import LARGE
 
 substances_networks = st.builds(
     lambda seed, nodes, arcs, lifetimes: with_substances(random_network(seed, nodes, arcs, lifetimes=lifetimes), seed),
@@ -592,10 +595,10 @@ def pooling(most_x: float = 100.0, cost_b: float = 16.0) -> tuple[Network, dict[
 @pytest.mark.medium
 @pytest.mark.parametrize(("options", "optimum"), [({}, 400.0), ({"cost_b": 13.0}, 750.0)])
 def test_plans_solve_pooling_problems(options: dict[str, float], optimum: float) -> None:
-    """Haverly's problems 1 and 3: the plan makes the known profit, and no bound is below it."""
+    """Haverly's problems 1 and 3: the plan makes the known profit, the bound is what envelopes of products allow."""
     network, budgets = pooling(**options)
     solution = bound(network, aim="cost", at_most=budgets, min_service=1.0)
-    assert solution.objective >= optimum * (1 - 1e-9)
+    assert solution.objective == pytest.approx({400.0: 500.0, 750.0: 875.0}[optimum], rel=1e-6)
     run = simulate_plan(improve_plan(solution))
     assert -run.accounts[0, 0] == pytest.approx(optimum, rel=1e-3)
     np.testing.assert_allclose(run.episode_levels[0], 1.0, atol=2e-4)
@@ -619,25 +622,112 @@ def test_no_episode_is_above_the_bound(network: Network, seed: int) -> None:
 
 
 @given(network=substances_networks, seed=st.integers(0, 1000))
-def test_shares_of_the_whole_are_in_the_ranges_of_programs(network: Network, seed: int) -> None:
-    """Of what leaves a node an arc gets, of all components, between the least and the greatest share of one of them."""
-    admissible = Admissible.of(network)
+def test_contents_of_flows_are_in_the_ranges_of_programs(network: Network, seed: int) -> None:
+    """Every component of every flow is between its least and its greatest part of the whole, whatever agents do."""
+    assume(follows_contents(network))
+    mixtures = Admissible.of(network).mixtures
+    assert mixtures is not None
     env = MultiAgentVectorEnv(network, num_envs=8)
     env.reset(seed=seed)
     rng = np.random.default_rng(seed)
-    for step in range(network.episode.horizon):
-        flow = env.advance(rng.choice([-1.0, 1.0], (len(env.actuators.control_rows), 8))).flow
-        size = 1e-9 * flow.sum()
-        for split in network.splits:
-            arcs = [*split.controlled_arcs, *split.other_arcs]
-            total = flow[arcs].sum(axis=0)
-            low, high = admissible.setting[:, step, arcs, None] * total
-            assert ((flow[arcs] >= low - size) & (flow[arcs] <= high + size)).all()
+    for _ in range(network.episode.horizon):
+        env.advance(rng.choice([-1.0, 1.0], (len(env.actuators.control_rows), 8)))
+        flow, mass = env.physical.flow, env.rows.stocks(env.physical.stock).sum(axis=0)
+        size = 1e-11 * mass / network.episode.control_interval + 1e-9 * flow.sum(axis=0)
+        of_substances = env.physical.substances.reshape(len(network.substances), len(network.arcs), 8)
+        parts = np.concatenate([(flow - of_substances.sum(axis=0))[None], of_substances])
+        low, high = (side[:, :, None] * flow for side in mixtures.content)
+        assert ((parts >= np.where(flow > size, low, 0.0) - size) & (parts <= high + size)).all()
 
 
-def test_the_bound_says_that_contents_are_taken_for_granted() -> None:
-    """Its text names the services, and MPC, which plans masses, refuses them."""
-    assert "it takes clean_flat, clean_long for granted" in str(bound(EXAMPLE, min_service=0.99, degree=1))
+@given(
+    network=substances_networks, seed=st.integers(0, 1000), degree=st.integers(1, 2), large=st.sampled_from((1, LARGE))
+)
+@pytest.mark.medium
+def test_no_episode_with_its_contents_is_above_their_bound(
+    network: Network, seed: int, degree: int, large: int
+) -> None:
+    """Of whatever levels an episode has, of contents too, λ̄ stays below the bound that demands them."""
+    assume(any(service.substance for service in network.services))
+    plan, rng = bound(network, degree=degree), np.random.default_rng(seed)
+    run = simulate_plan(replace(plan, actions=rng.choice([-1.0, 1.0, 0.0], plan.actions.shape)))
+    with patch("cirl_marl.optimum.program.LARGE", large):
+        limit = bound(network, degree=degree, min_service=np.maximum(run.episode_levels[0] - 1e-7, 0.0))
+    size = network.objective.reference_interval * float(np.abs(run.flow).sum(axis=1).max())
+    assert run.episode_circularity[0] <= limit.objective + 1e-8 * (1.0 + abs(limit.objective) + size)
+
+
+def test_plans_order_the_whole_of_a_flow() -> None:
+    """What is planned by components is asked for in one, whatever its donor has in it."""
+    order = Control(kind=ControlKind.FLOW, low=0.0, neutral=0.0, high=20.0)
+    network = Network(
+        name="orders",
+        nodes=(
+            Node(id="ore", role=Role.NONRENEWABLE_RESERVOIR, initial=(100.0, 100.0), content={"copper": 0.4}),
+            Node(id="mill", stores=False),
+            Node(id="use", initial=(0.0, 0.0)),
+            Node(id="tailings", role=Role.LANDFILL, initial=(0.0, 0.0)),
+        ),
+        arcs=(
+            Arc(id="ordered", donor="ore", recipient="mill", law=Law.CONTROLLED, control=order),
+            Arc(id="milled", donor="mill", recipient="use", law=Law.SHARE),
+            Arc(id="lost", donor="mill", recipient="tailings", law=Law.SHARE, share=0.5, transfer={"copper": 0.1}),
+        ),
+        services=(Service(id="wanted", provider="milled", quantity="flow", low=6.6, weight=1.0, owed_by=("ordered",)),),
+        substances=COPPER,
+        mass_unit="t",
+        time_unit="year",
+        episode=Episode(control_interval=1.0, horizon=3),
+    )
+    run = simulate_plan(bound(network, min_service=1.0))
+    np.testing.assert_allclose(run.flow[:, 0], 10.0, rtol=1e-6)  # 0.5·0.6 and 0.9·0.4 of it arrive
+    np.testing.assert_allclose(run.episode_levels, 1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("refilled", [False, True])
+def test_bounds_allow_what_idle_supplies_bring(refilled: bool) -> None:
+    """Of sources that make up for a service by weights, with contents of their own, which may change as they mix."""
+
+    def supply(name: str, weight: float) -> Arc:
+        control = Control(kind=ControlKind.FLOW, low=0.0, neutral=0.0, high=30.0)
+        return Arc(
+            id=f"{name}_in", donor=name, recipient="mill", law=Law.CONTROLLED, control=control,
+            makes_up_for="wanted", weight=weight,
+        )  # fmt: skip
+
+    sorter = Control(kind=ControlKind.TRANSFER, low=0.1, neutral=0.1, high=0.5, substances=("copper",))
+    mixing = Arc(id="mixing", donor="rich", recipient="poor", law=Law.EXOGENOUS, flow=400.0)
+    network = Network(
+        name="supplies",
+        nodes=(
+            Node(id="poor", role=Role.NONRENEWABLE_RESERVOIR, initial=(200.0, 200.0), content={"copper": 0.1}),
+            Node(id="rich", role=Role.NONRENEWABLE_RESERVOIR, initial=(1e4, 1e4), content={"copper": 0.5}),
+            Node(id="mill", stores=False),
+            Node(id="use", initial=(0.0, 0.0)),
+            Node(id="tailings", role=Role.LANDFILL, initial=(0.0, 0.0)),
+        ),
+        arcs=(
+            supply("poor", 0.25),
+            supply("rich", 0.75),
+            Arc(id="milled", donor="mill", recipient="use", law=Law.SHARE),
+            Arc(id="lost", donor="mill", recipient="tailings", law=Law.SHARE, share=0.5, control=sorter),
+            *([mixing] if refilled else []),
+        ),
+        services=(Service(id="wanted", provider="milled", quantity="flow", low=8.0, weight=1.0),),
+        substances=COPPER,
+        default_agents=("lost",),
+        mass_unit="t",
+        time_unit="year",
+        episode=Episode(control_interval=1.0, horizon=3),
+    )
+    run = simulate_plan(replace(bound(network), actions=-np.ones((3, 1))))
+    assert (run.flow[:, 1] > 1.0).all() and run.episode_levels[0] > 0.9
+    limit = bound(network, min_service=run.episode_levels[0] - 1e-9)
+    assert run.episode_circularity[0] <= limit.objective + 1e-6
+
+
+def test_mpc_refuses_services_of_contents() -> None:
+    """Its windows correct levels of masses."""
     env = MultiAgentVectorEnv(EXAMPLE, num_envs=1)
     with pytest.raises(CirlError, match=r"MPC plans masses, not contents, of which clean_flat, clean_long are"):
         MPC(min_service=0.99).start(env, 0)

@@ -46,6 +46,10 @@ class ComponentNetwork(StagedNetwork):
         """Return the compartment that one is a copy of, or itself."""
         return self.originals.get(id_, id_)
 
+    def components_of(self, id_: str) -> tuple[str, ...]:
+        """Return a compartment and its copies."""
+        return (id_, *(copy_id(id_, substance.id) for substance in self.substances))
+
 
 def copy_id(id_: str, substance: str) -> str:
     """Return what the copy of a node or an arc for a substance is called, as no part of a lifetime is."""

@@ -85,6 +85,10 @@ class Specification:
         """Return the compartment that one stands for: itself, unless it is the copy of one for a substance."""
         return id_
 
+    def components_of(self, id_: str) -> tuple[str, ...]:
+        """Return the compartments that stand for one: itself, and its copies for substances if there are any."""
+        return (id_,)
+
     def interval_means(self, value: Value) -> Floats:
         """Return a value in each control interval, its mean over the interval, shape (horizon,)."""
         horizon = self.episode.horizon

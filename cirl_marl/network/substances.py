@@ -47,6 +47,11 @@ def separates(network: Specification, split: Split) -> bool:
     return any(arc.transfer or (arc.control is not None and arc.control.substances) for arc in arcs)
 
 
+def follows_contents(network: Specification) -> bool:
+    """Whether masses or services depend on contents: where a node separates, or a service demands one."""
+    return any(service.substance for service in network.services) or bool(separated_substances(network))
+
+
 def contents(network: Specification, node: Node) -> list[float]:
     """Return the parts of a node's initial stock: what is no substance, then each substance; they sum to 1."""
     content: dict[str, Any] = dict(node.content)

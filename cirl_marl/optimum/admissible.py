@@ -10,6 +10,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from cirl_marl.dynamics.components import ComponentNetwork, copy_id
 from cirl_marl.dynamics.laws import LAWS
 from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.environments.actuators import Actuators
@@ -17,8 +18,8 @@ from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import positional_record, with_field_docs
 from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Node
-from cirl_marl.network.split_fractions import Split, splits
-from cirl_marl.network.substances import network_of_substance, separated_substances, separates
+from cirl_marl.network.split_fractions import Split
+from cirl_marl.optimum.content_ranges import Mixtures, content_ranges
 from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.vintages import Lifetimes
 
@@ -74,10 +75,13 @@ class Admissible:
     splits: Annotated[tuple[Split, ...], "the arcs that share what leaves a node"]
     capacity_arcs: Annotated[Integers, "arcs that the stock of another node limits"]
     capacity_rate: Annotated[Floats, "flow that a unit of it can carry, shape (steps, limited arcs), 1/time"]
+    mixtures: Annotated[Mixtures | None, "scheduled flows of components; None if contents are not followed"]
 
     @classmethod
-    def of(cls, network: Network, agents: Sequence[str] | None = None) -> Admissible:
+    def of(cls, network: Network, agents: Sequence[str] | None = None, content: Floats | None = None) -> Admissible:
         """Read the ranges off ``network`` while ``agents`` act and the others are neutral.
+
+        Of one that is written by components already the ``content`` of scheduled flows is given (``Mixtures``).
 
         Raises:
             NoCertificate: for inner physics, batches, or a solver that is not exact.
@@ -108,26 +112,30 @@ class Admissible:
             compartment = _setter(network, arc)
             if compartment is not None:
                 setting[:, :, k] = _control_range(network, compartment, agents)
-        with_capacity = [arc for arc in network.arcs if arc.capacity_node]
+        limited = np.array([bool(arc.capacity_node) for arc in network.arcs], dtype=bool)
+        setting[0][:, limited] = 0.0  # as long as nothing is built they carry nothing
+        with_capacity = [arc for arc in network.arcs if arc.capacity_node and network.original(arc.id) == arc.id]
         capacity_arcs = np.array([network.arc_index[arc.id] for arc in with_capacity], dtype=np.intp)
-        setting[0][:, capacity_arcs] = 0.0  # as long as nothing is built they carry nothing
         split_arcs = network.splits
         for split in split_arcs:
             arcs = [*split.controlled_arcs, *split.other_arcs]
             wishes = setting[:, :, list(split.controlled_arcs)].transpose(0, 2, 1)
             (low, high), (neutral, _) = share_ranges(split, wishes[[0, 2]]), share_ranges(split, wishes[[1, 1]])
             setting[:, :, arcs] = np.stack([low.T, neutral.T, high.T])
-        split_arcs = _with_separation(network, agents, split_arcs, setting)
         driver = np.where([arc.law is Law.RECIPIENT for arc in network.arcs], network.recipients, network.donors)
         driver[np.array([LAWS[arc.law].is_scheduled for arc in network.arcs], dtype=bool)] = -1
-        base = [network.interval_means(LAWS[arc.law].coefficient(arc, network)) for arc in network.arcs]
+        coefficients = [network.interval_means(LAWS[arc.law].coefficient(arc, network)) for arc in network.arcs]
+        base = np.array(coefficients, dtype=float).reshape(-1, steps).T
+        mixtures = None
+        if isinstance(network, ComponentNetwork):
+            mixtures = _mixtures(lifetimes, setting, valve, base, content)
         service_low = [network.interval_means(service.low) for service in network.services]
         return cls(
             network=network,
             lifetimes=lifetimes,
             actuators=actuators,
             driver=driver,
-            base=np.array(base, dtype=float).reshape(-1, steps).T,
+            base=base,
             setting=setting[::2],
             valve=valve[::2],
             neutral_setting=setting[1],
@@ -138,6 +146,7 @@ class Admissible:
             capacity_rate=np.array([network.interval_means(arc.capacity_rate) for arc in with_capacity], dtype=float)
             .reshape(-1, steps)
             .T,
+            mixtures=mixtures,
         )
 
     @property
@@ -271,29 +280,23 @@ def share_ranges(split: Split, wishes: Floats) -> Floats:
     return np.concatenate([low + over * cut, rest[:, None] * split.proportions], axis=1)
 
 
-def _with_separation(
-    network: Network, agents: Sequence[str], split_arcs: Sequence[Split], setting: Floats
-) -> tuple[Split, ...]:
-    """Return the splits, those that separate substances with the ranges of the whole, which widen ``setting``.
-
-    Of the components q_c of what is shared out an arc gets Σ_c s_c q_c: between the least and the greatest s_c of all.
-    """
-    whole = {split.donor: split for split in split_arcs}
-    for substance in separated_substances(network):
-        for split in splits(network_of_substance(network, substance)):
-            arcs = [*split.controlled_arcs, *split.other_arcs]
-            if not separates(network, split):
-                continue
-            controls = [_control_range(network, network.arcs[k], agents) for k in split.controlled_arcs]
-            wishes = np.array(controls).reshape(len(controls), 3, network.episode.horizon).transpose(1, 0, 2)
-            low, high = share_ranges(split, wishes[[0, 2]])
-            setting[0][:, arcs] = np.minimum(setting[0][:, arcs], low.T)
-            setting[2][:, arcs] = np.maximum(setting[2][:, arcs], high.T)
-            free, last = arcs[:-1], arcs[-1]
-            rest = np.full((1, network.episode.horizon), np.nan)
-            bounds = setting[:, :, free].transpose(0, 2, 1)
-            whole[split.donor] = Split(split.donor, tuple(free), (last,), bounds, rest)
-    return tuple(whole.values())
+def _mixtures(lifetimes: Lifetimes, setting: Floats, valve: Floats, base: Floats, content: Floats | None) -> Mixtures:
+    """Return the scheduled flows of components, and give those of each the part of ``setting`` that it can have."""
+    network, plan_network = lifetimes.network, lifetimes.plan_network
+    # written by components it has the same arcs first, then those within lifetimes, then copies
+    whole_arcs = network.arcs if content is None else network.arcs[: content.shape[2]]
+    arcs = np.array([[plan_network.arc_index[id_] for id_ in plan_network.components_of(k.id)] for k in whole_arcs])
+    arcs = arcs.astype(np.intp).reshape(-1, 1 + len(network.substances)).T
+    if content is None:
+        shares, by_share = np.ones((2, *arcs.shape)), [arc.law is Law.SHARE for arc in whole_arcs]
+        shares[0][:, by_share] = setting[0].min(axis=0)[arcs[:, by_share]]
+        shares[1][:, by_share] = setting[2].max(axis=0)[arcs[:, by_share]]
+        content = content_ranges(network, shares)
+    scheduled = np.flatnonzero([LAWS[arc.law].is_scheduled for arc in whole_arcs])
+    asked = (setting * valve[:, :, plan_network.donors] * base)[::2][:, :, arcs[0, scheduled]]
+    for (low, high), of_component in zip(content.transpose(1, 0, 2)[:, :, scheduled], arcs[:, scheduled], strict=True):
+        setting[:, :, of_component] *= np.stack([low, (low + high) / 2, high])[:, None]
+    return Mixtures(arcs, content, scheduled, asked)
 
 
 def _sets_transfer(arc: Arc) -> bool:
@@ -305,7 +308,7 @@ def _control_range(network: Network, compartment: Compartment, agents: Sequence[
     bounds = network.control_bounds[:, network.control_rows[compartment.id].start]
     # what is supplied while nobody acts depends on the state: all that may be is allowed
     supplies = isinstance(compartment, Arc) and bool(compartment.makes_up_for)
-    return bounds if compartment.id in agents or supplies else bounds[[1, 1, 1]]
+    return bounds if network.original(compartment.id) in agents or supplies else bounds[[1, 1, 1]]
 
 
 def _setter(network: Network, arc: Arc) -> Arc | Node | None:
@@ -367,6 +370,9 @@ def normalised_actions(
     valve = np.clip(valve, *valve_range)
     driver = np.where(admissible.by_schedule, 1.0, stock[:, admissible.driver])
     setting = np.clip(_ratio(flow, base * driver * valve[:, network.donors], neutral), *admissible.setting[:, period])
+    if (mixtures := admissible.mixtures) is not None:
+        first, *others = mixtures.arcs[:, mixtures.scheduled]
+        setting[:, first] += sum(setting[:, arcs] for arcs in others)
     actuators, steps = admissible.actuators, np.arange(period.start, period.stop)
     stretches = admissible.lifetimes.planned_stretches(layout, plan, initial, range(period.start, period.stop))
     actions = np.zeros((len(steps), len(actuators.control_rows)))
@@ -374,7 +380,9 @@ def normalised_actions(
         control = network.compartments[agent].control
         assert control is not None
         if agent in network.arc_index:
-            physical = setting[:, network.arc_index[agent]]
+            # of a transfer that of the first of its substances
+            id_ = copy_id(agent, control.substances[0]) if control.kind is ControlKind.TRANSFER else agent
+            physical = setting[:, network.arc_index[id_]]
         elif control.kind is ControlKind.RATE:
             physical = valve[:, network.node_index[agent]]
         elif control.kind is ControlKind.STRETCH:

@@ -240,6 +240,13 @@ def over(rates: RateTables, intervals: range) -> RateTables:
     return by_flow[:, period], by_stock[:, period]
 
 
+def _by_parts(rates: Floats, sums: sparse.csr_array) -> Floats:
+    """Return rates, shape (accounts, steps, …), of the parts that add up to what they are of."""
+    accounts, steps, places = rates.shape
+    parts: Floats = rates.reshape(accounts * steps, places) @ sums
+    return parts.reshape(accounts, steps, sums.shape[1])
+
+
 def account_rows(
     lifetimes: Lifetimes, layout: Layout, initial: Floats, rates: RateTables
 ) -> tuple[sparse.csr_array, Floats]:
@@ -255,8 +262,8 @@ def account_rows(
         Rows, shape (accounts, variables), and constants, shape (accounts,).
     """
     (by_flow, by_stock), steps = rates, rates[0].shape[1]
-    planned = by_stock.reshape(-1, by_stock.shape[2]) @ lifetimes.totals  # some are parts of the stock of a node
-    by_stock = planned.reshape(*by_stock.shape[:2], planned.shape[1])
+    # of stocks and flows some are parts of those of the network
+    by_stock, by_flow = _by_parts(by_stock, lifetimes.totals), _by_parts(by_flow, lifetimes.arc_sums)
     table = np.zeros((len(by_flow), steps, layout.size))
     for first in layout.flow.tolist():
         table[:, :, first : first + by_flow.shape[2]] = by_flow / len(layout.moments)

@@ -26,7 +26,6 @@ from cirl_marl.optimum.options import (
     by_stage,
     check_options,
     check_service,
-    contents_caveat,
     demanded_levels,
     levels_text,
     starting_stocks,
@@ -96,7 +95,6 @@ class Bound:
         agents = self.agents or self.network.agents
         idle = [arc.id for arc in self.network.arcs if arc.makes_up_for and arc.id not in agents]
         caveat = f"; {', '.join(idle)} may supply any amount within bounds in it" if idle else ""
-        caveat += contents_caveat(self.network)
         return f"{subject}: {statement}; its plan promises {plan}{caveat}"
 
     @property
@@ -384,7 +382,7 @@ def _solve_bound(
         degree=layout.degree,
         circularity=circularity,
         stock=stocks @ lifetimes.totals.T,
-        flow=layout.means(plan)[1][:, : len(lifetimes.network.arcs)],
+        flow=layout.means(plan)[1] @ lifetimes.arc_sums.T,
         actions=normalised_actions(admissible, layout, plan, start),
         problem=problem,
         solution=solution.plan,

@@ -6,11 +6,13 @@ Each function writes the rows of one family for an interval, or those that depen
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Iterator
 
 import numpy as np
 
 from cirl_marl.dynamics.stages import StagedNetwork
-from cirl_marl.network import Floats, Integers
+from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.elements import Service
 from cirl_marl.optimum.admissible import Admissible, IntervalRanges
 from cirl_marl.optimum.matrices import ProgramRows
 from cirl_marl.optimum.reach import Reach
@@ -145,13 +147,15 @@ def delivery_limits(ranges: IntervalRanges, rows: ProgramRows) -> None:
 def capacity_limits(ranges: IntervalRanges, rows: ProgramRows) -> None:
     """Add F_i − c·x_start, at most 0, for flows that a stock limits; keys (5, arc, moment).
 
-    x_start is what the stock is at the start of the interval, a node with a lifetime as a whole.
+    x_start is what the stock is at the start of the interval, a node with a lifetime, or components, as a whole.
     """
     layout, network = rows.layout, ranges.network
     for k, rate in zip(ranges.capacity_arcs.tolist(), ranges.capacity_rate.tolist(), strict=True):
-        parts = ranges.totals[[network.node_index[network.arcs[k].capacity_node]]].toarray()[0]
+        arc = network.arcs[k]
+        parts = ranges.totals[[network.node_index[arc.capacity_node]]].toarray()[0]
         row, stores = rows.add(5, k, layout.moments), np.flatnonzero(parts)
-        rows.put(row, layout.flow + k, 1.0)
+        for component in network.components_of(arc.id):
+            rows.put(row, layout.flow + network.arc_index[component], 1.0)
         rows.at_start(row[:, None], 0, stores, -rate * parts[stores])
 
 
@@ -188,8 +192,8 @@ def _hold_schedules(rows: ProgramRows, arcs: Integers, moment: Integers, first: 
 def service_levels(ranges: IntervalRanges, rows: ProgramRows) -> None:
     """Add low·level − q ≤ 0 for each service and ±Δ·σ_env·f̄ − imbalance ≤ 0; their keys are (1, …).
 
-    The level is at most min(1, q/low): a finite upper end of the band could only lower it further. Of contents, which
-    the program does not follow, nothing is said.
+    The level is at most min(1, q/low): a finite upper end of the band could only lower it further. Contents are with
+    the components (``mixtures``).
     """
     layout, network, count = rows.layout, ranges.network, len(rows.layout.moments)
     for s, service in enumerate(network.services):
@@ -197,18 +201,30 @@ def service_levels(ranges: IntervalRanges, rows: ProgramRows) -> None:
             continue
         row = rows.add(1, s)
         rows.put(row, layout.level + s, ranges.service_low[s])  # level ≤ q/low; level ≤ 1 is a box
-        if service.quantity == "stock":
-            stages = network.stages if isinstance(network, StagedNetwork) else {}
-            for store in (store for node in service.providers for store in stages.get(node, (node,))):
-                rows.put(row, layout.end[-1] + network.node_index[store], -1.0)
-        else:
-            rows.put(row, layout.flow[layout.moment_column] + network.service_arcs(service), -1.0 / count)
+        for at_end, column in service_columns(network, service):
+            if at_end:
+                rows.put(row, layout.end[-1] + column, -1.0)
+            else:
+                rows.put(row, layout.flow[layout.moment_column] + column, -1.0 / count)
     weights = -network.circularity_weights[1]
     arcs = np.flatnonzero(weights)
     pair = rows.add(1, len(network.services), [0, 1])
     for row, sign in zip(pair, (1.0, -1.0), strict=True):
         rows.put(row, layout.flow[layout.moment_column] + arcs, sign * weights[arcs] / count)
     rows.put(pair, layout.imbalance, -1.0)
+
+
+def service_columns(network: Network, service: Service, component: int | None = None) -> Iterator[tuple[bool, int]]:
+    """Yield whether a service reads a stock, at the end, or a flow, and its place, of all components or of one."""
+    stages = network.stages if isinstance(network, StagedNetwork) else {}
+    selected = slice(None) if component is None else slice(component, component + 1)
+    if service.quantity == "stock":
+        for node in (part for id_ in service.providers for part in network.components_of(id_)[selected]):
+            yield from ((True, network.node_index[store]) for store in stages.get(node, (node,)))
+        return
+    arcs = [network.arcs[k].id for k in network.service_arcs(service)]
+    for arc in (part for id_ in arcs if network.original(id_) == id_ for part in network.components_of(id_)[selected]):
+        yield False, network.arc_index[arc]
 
 
 def valve_envelopes(admissible: Admissible, reach: Reach, intervals: range, rows: ProgramRows) -> None:
@@ -297,16 +313,23 @@ def least_deliveries(admissible: Admissible, reach: Reach, intervals: range, row
 def _idle_groups(admissible: Admissible) -> list[tuple[Integers, Floats]]:
     """Return the idle arcs of each service that several make up for, with their weights w.
 
-    Left out are those of which the valve of a donor acts as well.
+    Each component has arcs of its own, which carry the part of w that they have of what is supplied. Left out are those
+    of which the valve of a donor acts as well, and those of which this part may change.
     """
-    network, groups = admissible.network, defaultdict[str, list[int]](list)
-    for k, arc in enumerate(network.arcs):
-        if arc.makes_up_for and arc.id not in admissible.agents:
-            groups[arc.makes_up_for].append(k)
-    valves = admissible.valve[:, :, network.donors]
+    network, mixtures = admissible.network, admissible.mixtures
     weights = np.array([1.0 if arc.weight is None else arc.weight for arc in network.arcs])
+    component, varies = np.zeros((2, len(network.arcs)), dtype=np.intp)
+    if mixtures is not None:
+        component[mixtures.arcs] = np.arange(len(mixtures.arcs))[:, None]
+        varies[mixtures.arcs] = mixtures.varies
+        weights[mixtures.arcs] *= mixtures.content[0]
+    groups = defaultdict[tuple[str, int], list[int]](list)
+    for k, arc in enumerate(network.arcs):
+        if arc.makes_up_for and network.original(arc.id) not in admissible.agents:
+            groups[arc.makes_up_for, int(component[k])].append(k)
+    valves = admissible.valve[:, :, network.donors]
     return [
         (np.array(arcs), weights[arcs])
         for arcs in groups.values()
-        if len(arcs) > 1 and weights[arcs].any() and (valves[:, :, arcs] == 1.0).all()
+        if len(arcs) > 1 and weights[arcs].any() and not varies[arcs].any() and (valves[:, :, arcs] == 1.0).all()
     ]

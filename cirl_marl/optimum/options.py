@@ -115,12 +115,6 @@ def levels_text(network: Network, levels: Floats) -> str:
     return ", ".join(f"{level:g} of '{service.id}'" for level, service in zip(levels, network.services, strict=True))
 
 
-def contents_caveat(network: Network) -> str:
-    """Say what bounds take for granted: services of contents, which programs do not follow; empty without any."""
-    contents = [service.id for service in network.services if service.substance]
-    return f"; it takes {', '.join(contents)} for granted, as it does not follow contents" if contents else ""
-
-
 def check_margin(margin: float) -> None:
     """Refuse a margin that is not positive and finite.
 

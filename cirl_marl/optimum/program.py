@@ -17,7 +17,6 @@ from scipy import sparse
 from cirl_marl.dynamics.ledger import Ledger
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import frozen_record
-from cirl_marl.network.substances import separated_substances
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.aims import Aims, account_rows, over
 from cirl_marl.optimum.constraints import (
@@ -34,6 +33,7 @@ from cirl_marl.optimum.constraints import (
     valve_envelopes,
 )
 from cirl_marl.optimum.matrices import BEFORE, NOW, ChainedRows, IntervalCache, Layout, ProgramRows, RowParts
+from cirl_marl.optimum.mixtures import content_rows, mixture_rows
 from cirl_marl.optimum.quasi_steady import decay_rows, end_laws, has_fast_stocks, quasi_steady_rows
 from cirl_marl.optimum.reach import ComparisonSystem, Reach
 from cirl_marl.optimum.transit import ConstantShares, Transit, steady_rows
@@ -120,12 +120,13 @@ class Programs:
         self.admissible, lifetimes = admissible, admissible.lifetimes
         has_lifetimes = lifetimes.plan_network is not lifetimes.reach_network
         if system is None:
-            chain_form = Admissible.of(lifetimes.reach_network, admissible.agents) if has_lifetimes else admissible
+            content = None if admissible.mixtures is None else admissible.mixtures.content
+            chain_form = admissible
+            if has_lifetimes:
+                chain_form = Admissible.of(lifetimes.reach_network, admissible.agents, content)
             system = ComparisonSystem(chain_form, cache)
         self.system = system
-        # where nodes separate substances shares of the whole follow its content, which schedules change in substeps
-        separates = bool(separated_substances(admissible.network))
-        constant_shares = constant_shares and not (hold_controls or separates) and layout is None
+        constant_shares = constant_shares and not hold_controls and layout is None
         self._transit: Transit | None = None
         self.layout = layout = layout or _layout(admissible, system.substeps, merge_pieces, degree, large)
         if constant_shares and layout.size * len(admissible.kinds) <= LARGE:
@@ -207,7 +208,10 @@ class Programs:
         intervals = range(network.episode.horizon) if intervals is None else intervals
         steps, period, lifetimes = len(intervals), slice(intervals.start, intervals.stop), admissible.lifetimes
         reach, lifetime_flow = _reach(lifetimes, self.system, initial, intervals)
-        cut = np.where(admissible.by_schedule & ~reach.uncut, admissible.rate[1, period], 0.0)
+        changes, mixtures = ~reach.uncut, admissible.mixtures
+        if mixtures is not None:
+            changes[:, mixtures.arcs[:, mixtures.varies].ravel()] = True  # a content, as if they were cut
+        cut = np.where(admissible.by_schedule & changes, admissible.rate[1, period], 0.0)
         start, kinds = lifetimes.start_planned @ initial, admissible.kinds[period]
         equal, equal_to = self._equal.over(kinds, start, cut)
         under, under_to = self._under.over(kinds, start, cut)
@@ -215,6 +219,10 @@ class Programs:
         valve_envelopes(admissible, reach, intervals, rows)
         idle_supplies(admissible, reach, intervals, rows)
         least_deliveries(admissible, reach, intervals, rows)
+        low, high = _box(admissible, reach, lifetime_flow, layout, period)
+        if mixtures is not None:
+            mixture_rows(admissible, reach, intervals, rows)
+            content_rows(admissible, high.reshape(steps, -1), intervals, rows)
         from_start = rows.matrices()[0]
         from_start.eliminate_zeros()
         lifetime_rows, lifetime_limits = lifetimes.rows(layout, initial, intervals)
@@ -234,7 +242,6 @@ class Programs:
             levels = sparse.eye_array(services, layout.size, k=layout.level)
             blocks.append(sparse.kron(np.full((1, steps), -1.0 / steps), levels, format="csr"))
             limits.append(-np.broadcast_to(min_service, services))
-        low, high = _box(admissible, reach, lifetime_flow, layout, period)
         return Program(
             layout=layout,
             cost=cost,

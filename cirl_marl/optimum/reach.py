@@ -239,7 +239,9 @@ class ComparisonSystem:
                 least_part = np.minimum(
                     1.0, np.divide(upper * linear.share, asked, out=np.ones(stores), where=asked > 0)
                 )
-                slope = np.divide(least_part * (1 - ROUNDING), upper, out=np.zeros(stores), where=upper > 0)
+                slope = np.divide(
+                    least_part * (1 - ROUNDING), upper, out=np.zeros(stores), where=upper > ROUNDING * mass
+                )
                 chord[step] = np.minimum(chord[step], np.append(slope, 0.0)[np.minimum(network.donors, stores)])
                 least_in, least_out = self._by_node(least * part)
                 constant = np.concatenate([linear.routes.least(least_in) - outflow, stock_inflow - least_out])

@@ -19,7 +19,7 @@ from cirl_marl.optimum.aims import NO_AIMS, Aims, budget_texts
 from cirl_marl.optimum.certificate import Certificate, verify
 from cirl_marl.optimum.draw_proofs import Sampling, draw, prove_draws
 from cirl_marl.optimum.draws import DrawProgram, Prices
-from cirl_marl.optimum.options import contents_caveat, levels_text, starting_stocks
+from cirl_marl.optimum.options import levels_text, starting_stocks
 from cirl_marl.optimum.price_fit import fit_prices
 from cirl_marl.optimum.solver import LARGE_PROGRAM
 from cirl_marl.optimum.vintages import Lifetimes
@@ -187,7 +187,7 @@ class UncertainBound:
         return (
             f"bound of {self.network.name} for who does not foresee: mean λ̄ ≤ {self.value:.6g} {mass}{demand} (at most "
             f"{self.upper:.6g} with 95 % confidence, {len(self.values)} draws; with perfect information "
-            f"{self.perfect_information:.6g}){hidden}{failures}{contents_caveat(self.network)}"
+            f"{self.perfect_information:.6g}){hidden}{failures}"
         )
 
 

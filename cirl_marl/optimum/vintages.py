@@ -19,12 +19,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
 from typing import Annotated, Any
 
 import numpy as np
 from scipy import sparse
 
-from cirl_marl.dynamics.components import simulated_network
+from cirl_marl.dynamics.components import ComponentNetwork, component_network, copy_id, simulated_network
 from cirl_marl.dynamics.laws import ArcRates
 from cirl_marl.dynamics.stages import StagedNetwork, staged_network
 from cirl_marl.dynamics.state_layout import StateLayout
@@ -32,6 +34,7 @@ from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Node
 from cirl_marl.network.lifetimes import Chain
+from cirl_marl.network.substances import follows_contents
 from cirl_marl.optimum.kernels import Kernel, unit_outflow
 from cirl_marl.optimum.matrices import IntervalCache, Layout
 from cirl_marl.optimum.stretched import StretchedRows, planned_turnovers
@@ -45,7 +48,9 @@ class WholeLifetime:
     """A lifetime as the program has it."""
 
     node: Annotated[Node, "whose it is"]
-    rows: Annotated[Integers, "of its stages, or slots, among the stocks of the simulator, shape (components, stages)"]
+    rows: Annotated[
+        Integers, "of its stages, or slots, among the stocks of the simulator, shape (components that it has, stages)"
+    ]
     exit_arc: Annotated[int, "the arc of the planned network through which what has lived goes"]
     inflow_arcs: Annotated[Integers, "its arcs through which something enters"]
     rate: Annotated[Floats, "μ in each interval, shape (steps,), 1/time; empty for a fixed one"]
@@ -83,9 +88,9 @@ class Lifetimes:
         network: as it is given.
         simulator_network: as the simulator has it.
         state_layout: which row of its stocks is what.
-        plan_network: as the program has it.
+        plan_network: as the program has it; where contents matter, with a copy for each substance.
         reach_network: as stocks are bounded, all lifetimes but fixed ones being chains.
-        whole: the lifetimes.
+        whole: the lifetimes, of each component its own if the program has components.
         exit_arcs: arcs of the planned network that come out of these.
         most_factor: most that multiplies what comes out of each, shape (steps, lifetimes).
         start_planned: what the stores of the planned network hold of the stocks of the simulator, (stores, stocks).
@@ -93,7 +98,9 @@ class Lifetimes:
         nodes_reached: what the nodes of the planned network are of those of ``reach_network``, shape (nodes, nodes).
         arcs_reached: arcs of ``reach_network`` that are those of the planned network, shape (arcs,).
         cache: kernels of their rows, which do for other networks whose lifetimes are alike.
-        totals: what the stocks of the network are of those of the planned one, shape (stores, stores).
+        sums: what the nodes of the network are of those of the planned one, shape (nodes, nodes).
+        totals: the part of it of stocks, shape (stores, stores).
+        arc_sums: what the arcs of the network are of those of the planned one, shape (arcs, arcs).
     """
 
     def __init__(self, network: Network, agents: Sequence[str]) -> None:
@@ -103,48 +110,66 @@ class Lifetimes:
         self.state_layout = StateLayout(self.simulator_network)
         self.whole: list[WholeLifetime] = []
         self.cache = IntervalCache()
-        components = self.state_layout.components
         nodes = [node for node in network.stores if node.lifetime is not None]
-        if nodes:
+        separate = follows_contents(network) and not isinstance(network, ComponentNetwork)
+        if nodes or separate:
             fixed_nodes = [node.id for node in nodes if node.lifetime is not None and node.lifetime.chain is None]
-            self.plan_network = staged_network(network, {node.id for node in nodes})
-            self.reach_network = staged_network(network, fixed_nodes)
-        plan_network, reach_network = self.plan_network, self.reach_network
-        for node in nodes:
-            assert isinstance(plan_network, StagedNetwork) and node.lifetime is not None
-            place, chain, rate, factor = network.node_index[node.id], node.lifetime.chain, np.zeros(0), np.zeros((2, 0))
-            if chain is not None:
-                rate = chain.rate / node.lifetime.mean / network.interval_means(node.stretch)
-                if node.control is not None:
-                    high, neutral, low = 1.0 / network.control_bounds[:, network.control_rows[node.id].start]
-                    if node.id in agents:
-                        factor = np.stack([low, high])
-                    else:
-                        rate = rate * neutral
-            self.whole.append(
-                WholeLifetime(
-                    node=node,
-                    rows=self.state_layout.stages.get(place, np.array([place])).reshape(components, -1),
-                    exit_arc=plan_network.arc_index[plan_network.release_arcs[node.id]],
-                    inflow_arcs=np.flatnonzero(plan_network.recipients == plan_network.node_index[node.id]),
-                    rate=rate,
-                    factor=factor,
-                    reached_entry=reach_network.node_index[node.id if chain is None else f"{node.id}.entry"],
-                    reached_node=reach_network.node_index[node.id],
-                    reached_arc=reach_network.arc_index[plan_network.release_arcs[node.id]],
-                )
-            )
+            plan, reach = (staged_network(network, whole) for whole in ({node.id for node in nodes}, fixed_nodes))
+            if separate:
+                plan, reach = component_network(plan), component_network(reach)
+            self.plan_network, self.reach_network = plan, reach if nodes else plan
+        substances = ("", *(substance.id for substance in network.substances)) if separate else ("",)
+        for node, (component, substance) in product(nodes, enumerate(substances)):
+            self.whole.append(self._whole(node, substance, component if separate else None, agents))
         self.exit_arcs = np.array([lifetime.exit_arc for lifetime in self.whole], dtype=np.intp)
         self.most_factor = np.ones((network.episode.horizon, len(self.whole)))
         for place, lifetime in enumerate(self.whole):
             if lifetime.factor.size:
                 self.most_factor[:, place] = lifetime.factor[1]
         stocks = self.state_layout.nodes.stop
+        plan_network, reach_network = self.plan_network, self.reach_network
         self.start_planned = _sums(self.simulator_network, plan_network)[: len(plan_network.stores), :stocks]
         self.start_reached = _sums(self.simulator_network, reach_network)[: len(reach_network.stores), :stocks]
         self.nodes_reached = _sums(reach_network, plan_network)
         self.arcs_reached = np.array([reach_network.arc_index[arc.id] for arc in plan_network.arcs], dtype=np.intp)
-        self.totals = _sums(plan_network, network)[: len(network.stores), : len(plan_network.stores)]
+        self.sums = _sums(plan_network, network)
+        self.totals = self.sums[: len(network.stores), : len(plan_network.stores)]
+        originals = [plan_network.original(arc.id) for arc in plan_network.arcs]
+        places = [(network.arc_index[id_], k) for k, id_ in enumerate(originals) if id_ in network.arc_index]
+        rows, columns = np.array(places, dtype=np.intp).reshape(-1, 2).T
+        shape = (len(network.arcs), len(plan_network.arcs))
+        self.arc_sums = sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape=shape)
+
+    def _whole(self, node: Node, substance: str, component: int | None, agents: Sequence[str]) -> WholeLifetime:
+        """Return the lifetime of a node, or, of a network that is planned by components, that of one of them there."""
+        network, plan_network, reach_network = self.network, self.plan_network, self.reach_network
+        assert isinstance(plan_network, StagedNetwork) and node.lifetime is not None
+        place, chain, rate, factor = network.node_index[node.id], node.lifetime.chain, np.zeros(0), np.zeros((2, 0))
+        if chain is not None:
+            rate = chain.rate / node.lifetime.mean / network.interval_means(node.stretch)
+            if node.control is not None:
+                high, neutral, low = 1.0 / network.control_bounds[:, network.control_rows[node.id].start]
+                if node.id in agents:
+                    factor = np.stack([low, high])
+                else:
+                    rate = rate * neutral
+        rows = self.state_layout.stages.get(place, np.array([place])).reshape(self.state_layout.components, -1)
+
+        def name(id_: str) -> str:
+            return copy_id(id_, substance) if substance else id_
+
+        own, exit_arc = name(node.id), plan_network.release_arcs[name(node.id)]
+        return WholeLifetime(
+            node=replace(node, id=own),
+            rows=rows if component is None else rows[[component]],
+            exit_arc=plan_network.arc_index[exit_arc],
+            inflow_arcs=np.flatnonzero(plan_network.recipients == plan_network.node_index[own]),
+            rate=rate,
+            factor=factor,
+            reached_entry=reach_network.node_index[own if chain is None else name(f"{node.id}.entry")],
+            reached_node=reach_network.node_index[own],
+            reached_arc=reach_network.arc_index[exit_arc],
+        )
 
     def pieces(self, degree: int, most: int) -> int:
         """Return the pieces of an interval, at most ``most``, in which stocks turn over once and kernels are smooth."""
@@ -295,7 +320,8 @@ def _sums(fine: Network, coarse: Network) -> Any:
     stages = fine.stages if isinstance(fine, StagedNetwork) else {}
     components: dict[str, list[str]] = {}
     for node in fine.nodes:
-        components.setdefault(fine.original(node.id), []).append(node.id)
+        own = node.id if isinstance(coarse, ComponentNetwork) else fine.original(node.id)
+        components.setdefault(own, []).append(node.id)
     whole = coarse.stages if isinstance(coarse, StagedNetwork) else {}
     sums = sparse.lil_array((len(coarse.nodes), len(fine.nodes)))
     for i, node in enumerate(coarse.nodes):

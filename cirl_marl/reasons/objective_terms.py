@@ -70,12 +70,13 @@ class LinearFunctional:
     def columns(self, layout: Layout, lifetimes: Lifetimes, steps: int) -> Floats:
         """Return its weights on the variables of a program, shape (steps · size,)."""
         weights = np.zeros((steps, layout.size))
-        count, stores = len(layout.moments), len(layout.network.stores)
-        for moment in layout.moments:
+        count, stores = len(layout.moments), len(lifetimes.network.stores)
+        nodes, arcs = len(layout.network.nodes), len(layout.network.arcs)
+        for stock, flow in zip(layout.stock.tolist(), layout.flow.tolist(), strict=True):
             if self.flow is not None:
-                weights[:, layout.flow[moment] :][:, : self.flow.shape[1]] += self.flow / count
+                weights[:, flow : flow + arcs] += self.flow @ lifetimes.arc_sums / count
             if self.through is not None:
-                weights[:, layout.stock[moment] + stores :][:, : self.through.shape[1]] += self.through / count
+                weights[:, stock : stock + nodes] += self.through @ lifetimes.sums[stores:] / count
         if self.stock is not None:
             weights[:, layout.last] += self.stock @ lifetimes.totals
         if self.level is not None:
