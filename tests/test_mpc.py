@@ -256,8 +256,7 @@ def test_keeps_the_service_from_random_starts(name: str, horizon: int | None) ->
     assert (gap >= 0).all() and (gap < 0.03).all(), gap
 
 
-@pytest.mark.medium
-@pytest.mark.sample(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("horizon", [6, 10])
 def test_windows_begin_anew_where_what_was_learnt_leaves_no_plan(horizon: int) -> None:
     """Ranges of exports change from year to year: what a control was in the last year of a window may later be none."""

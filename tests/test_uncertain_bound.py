@@ -629,8 +629,8 @@ def test_a_dropped_draw_is_an_error(found: Any, monkeypatch: pytest.MonkeyPatch)
         small_bound()
 
 
-@pytest.mark.medium
-@pytest.mark.parametrize("start", [None, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("start", [None, 1])
 def test_prices_are_fitted_where_hardly_anything_happens(start: int | None) -> None:
     """What differs between draws by rounding alone has no price; a bound needs draws in which something happens."""
     network = works(4, Markov(values=(1.0, 0.3), lengths=(60, 5), start=start))

@@ -73,7 +73,7 @@ def kept() -> Any:
     return small_bound(BOTH)
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_who_keeps_budgets_on_average_stays_below(kept: Any) -> None:
     """In every draw with the penalty, whatever is booked; a mean that keeps the budgets is below the mean bound."""
     free, network = small_bound(None), kept.network
