@@ -794,6 +794,15 @@ def test_plans_keep_grades(low: float, high: float, costs: tuple[float, float], 
     assert run.accounts[0, 0] >= -solution.objective - 1e-9
 
 
+@pytest.mark.slow
+def test_alloys_of_aluminium_are_planned() -> None:
+    """Castings have enough alloying elements and not too many, all else few; the plan comes to the bound."""
+    limit = bound("aluminium_world", scenario="alloys", min_service=1.0, degree=1)
+    run = simulate_plan(improve_plan(limit, starts=1))
+    assert limit.gap(run.episode_circularity[0]) < 0.01
+    np.testing.assert_allclose(run.episode_levels, 1.0, atol=2e-4)
+
+
 def test_corrections_of_steps_leave_contents_out() -> None:
     """What an episode was away from its program is told of masses, which steps read, not of contents."""
     solution = bound(blending(0.06), min_service=1.0)
