@@ -39,10 +39,11 @@ from cirl_marl import (
 from cirl_marl.definitions.writer import definition_of
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.environments.vector import MultiAgentVectorEnv
+from cirl_marl.network.disturbances import AutoRegression, DisturbanceEffect
 from cirl_marl.network.elements import FIXED_LIFETIME, Lifetime
 from cirl_marl.network.series import extremes
 from cirl_marl.network.substances import follows_contents
-from cirl_marl.network.uncertainty import Spread
+from cirl_marl.network.uncertainty import Spread, draw_network
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.linearised import jacobians, step_program
 from cirl_marl.optimum.program import LARGE
@@ -206,6 +207,58 @@ def test_draws_of_shares_and_transfers_are_networks(network: Network, seed: int)
             alone.advance(action[:, None])
         masses, expected = alone.physical.stock[:, 0], env.physical.stock[:, copy]
         np.testing.assert_allclose(masses, expected, rtol=1e-9, atol=1e-10 * expected.sum())
+
+
+def test_contents_of_initial_stocks_are_drawn() -> None:
+    """Each copy has its own, with a lifetime or not, and moves as the network that was drawn; masses are the same."""
+    lifetime = Lifetime(mean=3.0, deviation=1.0, distribution="normal")
+    network = Network(
+        name="drawn",
+        nodes=(
+            Node(id="cars", initial=(40.0, 60.0), lifetime=lifetime, content={"copper": 0.1}),
+            Node(id="scrap", initial=(10.0, 10.0), content={"copper": 0.2}),
+            Node(id="sink", role=Role.LANDFILL, initial=(0.0, 0.0)),
+        ),
+        arcs=(
+            Arc(id="scrapped", donor="cars", recipient="scrap", law=Law.SHARE),
+            Arc(id="lost", donor="scrap", recipient="sink", rate=0.3),
+        ),
+        substances=COPPER,
+        uncertain={
+            "nodes.cars.content.copper": Spread(low=0.5, high=2.0, distribution="uniform"),
+            "nodes.scrap.content.copper": Spread(deviation=0.2),
+        },
+        mass_unit="t",
+        time_unit="year",
+        episode=Episode(control_interval=1.0, horizon=4),
+    )
+    drawn, stated = (MultiAgentVectorEnv(network, num_envs=5, uncertain=uncertain) for uncertain in (True, False))
+    for env in (drawn, stated):
+        env.reset(seed=3)
+    factors = drawn.physical.factors
+    assert factors.shape == (2, 5) and (np.ptp(factors, axis=1) > 0.1).all()
+    masses = drawn.rows.stocks(drawn.physical.stock)
+    np.testing.assert_allclose(masses, stated.rows.stocks(stated.physical.stock), rtol=1e-12)
+    content = drawn.rows.substances(drawn.physical.stock)[:2] / masses[:2]
+    np.testing.assert_allclose(content, factors * np.array([[0.1], [0.2]]), rtol=1e-12)
+    for copy in range(5):
+        lone = MultiAgentVectorEnv(draw_network(network, factors[:, copy].tolist()), num_envs=1)
+        lone.reset(options={"initial_state": dict(zip(("cars", "scrap"), masses[:2, copy].tolist(), strict=True))})
+        np.testing.assert_allclose(lone.physical.stock[:, 0], drawn.physical.stock[:, copy], rtol=1e-12, atol=1e-15)
+    for _ in range(4):
+        drawn.advance(np.zeros((0, 5)))
+    drawn.reset()  # the next draw
+    assert not np.array_equal(drawn.physical.factors, factors)
+
+
+def test_contents_that_no_stock_can_have_are_not_drawn() -> None:
+    """Nor are they disturbed in time."""
+    network, path = load_network(EXAMPLE), "nodes.wires.content.copper"
+    with pytest.raises(NetworkError, match=r"some draws of its contents sum to 1\.5, more than 1; give ranges"):
+        replace(network, uncertain={path: Spread(low=0.5, high=1.5, distribution="uniform")})
+    ups = AutoRegression(mean=1.0, deviation=0.1, persistence=0.5, low=0.5, high=1.5)
+    with pytest.raises(NetworkError, match="what is in a stock at the start cannot be disturbed in time, but drawn"):
+        replace(network, disturbances={"ups": ups}, disturbed={path: DisturbanceEffect(by="ups")})
 
 
 def test_draws_of_releases_are_those_of_all_components() -> None:

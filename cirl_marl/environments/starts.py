@@ -15,6 +15,7 @@ from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.compartment_model import DiscreteTimeModel, GoalTask
 from cirl_marl.network.initial_ages import start_shares
 from cirl_marl.network.processes import Paths, disturbance_stream
+from cirl_marl.network.uncertainty import CONTENT, numbers_of
 
 
 class Starts:
@@ -44,6 +45,11 @@ class Starts:
         self._rows |= self._stages
         interval = network.episode.control_interval
         self._spread = {id_: start_shares(network, network.stores[i], interval) for i, id_ in ids.items()}
+        self._components, substances = rows.components, [substance.id for substance in network.substances]
+        self._uncertain_contents = [
+            (part + 1, numbers_of(network.uncertain, "nodes", f"{CONTENT}{substance}"))
+            for part, substance in enumerate(substances)
+        ]
         inseparable = {name for names in self._wholes.values() for name in names}
         self._array_order = () if inseparable & set(order) else tuple(order)
         self._physical, self._stocks, self._inner = dynamics.physical, rows.nodes.stop, inner
@@ -59,26 +65,31 @@ class Starts:
         """Whether two copies can begin differently, or be disturbed by other values."""
         return bool(self._width.any() or len(self._of_models) or self.processes.names)
 
-    def begin(self, seed: int | Sequence[int] | None, options: Mapping[str, Any] | None) -> Floats:
-        """Return the state in which every copy starts, shape (rows, B); see ``MultiAgentVectorEnv.reset``."""
+    def begin(
+        self, seed: int | Sequence[int] | None, options: Mapping[str, Any] | None, *, uncertain: bool
+    ) -> tuple[Floats, Floats]:
+        """Return the state in which every copy starts, and what is drawn; see ``MultiAgentVectorEnv.reset``.
+
+        Shapes are (rows, B) and (numbers, B), without numbers unless they are ``uncertain``.
+        """
         seeds = None if seed is None else self._seeds(seed)
         initial_state = self._initial_state({} if options is None else options)
         if seeds is not None:  # not before, so that what is refused changes nothing
             self.streams = [np.random.default_rng(s) for s in seeds]
             self.disturbance_streams = self._disturbance_streams(seeds)
-        start = self.draw(range(len(self.streams)))
+        start, factors = self.draw(range(len(self.streams)), uncertain=uncertain)
         for rows in self._stages.values():
             if any(self.names[row] in initial_state for row in rows):
                 start[rows] = 0.0  # stages that are not given are empty
         for name, values in initial_state.items():
-            spread_ = self._spread.get(name)
-            start[self._rows[name]] = values if spread_ is None else spread_[:, None] * values
-        return start
+            start[self._rows[name]] = self._drawn_spread(name, factors) * values if name in self._spread else values
+        return start, factors
 
-    def draw(self, copies: Sequence[int] | range | Integers) -> Floats:
-        """Draw initial stocks and inner states of some copies, each from its own stream, shape (rows, len(copies)).
+    def draw(self, copies: Sequence[int] | range | Integers, *, uncertain: bool) -> tuple[Floats, Floats]:
+        """Draw initial stocks and inner states of some copies, each from its own stream, and ``uncertain`` numbers.
 
-        Models that draw their own start come first, so that a lone robot starts as it does in its own library.
+        Models that draw their own start come first, so that a lone robot starts as it does in its own library. Shapes
+        are (rows, len(copies)) and (numbers, len(copies)).
         """
         by_copy = np.empty((len(copies), len(self._low)))
         of_models = np.empty((len(self._of_models), len(copies)))
@@ -89,15 +100,29 @@ class Starts:
         uniform = np.ascontiguousarray(by_copy.T)
         uniform *= self._width[:, None]
         uniform += self._low[:, None]
+        factors = self._factors(copies) if uncertain else np.empty((0, len(copies)))
         if len(uniform) == len(self.names):
-            return uniform
+            return uniform, factors
         start = np.empty((len(self.names), len(copies)))
         start[self._uniform], start[self._of_models] = uniform, of_models
         for id_, rows in self._stages.items():
-            start[rows] = self._spread[id_][:, None] * uniform[self._network.node_index[id_]]
-        return start
+            start[rows] = self._drawn_spread(id_, factors) * uniform[self._network.node_index[id_]]
+        return start, factors
 
-    def factors(self, copies: Sequence[int] | range | Integers) -> Floats:
+    def _drawn_spread(self, node: str, factors: Floats) -> Floats:
+        """Return the part of a stock that is in each of its rows, with the contents that were drawn, (rows, 1 or B)."""
+        spread = self._spread[node][:, None]
+        drawn = [(part, numbers[node]) for part, numbers in self._uncertain_contents if node in numbers]
+        if not drawn or not len(factors):
+            return spread
+        parts = np.repeat(spread, factors.shape[1], axis=1).reshape(self._components, -1, factors.shape[1])
+        whole = parts.sum(axis=0)
+        for part, number in drawn:
+            parts[part] *= factors[number]
+        parts[0] = np.maximum(whole - parts[1:].sum(axis=0), 0.0)
+        return parts.reshape(-1, factors.shape[1])
+
+    def _factors(self, copies: Sequence[int] | range | Integers) -> Floats:
         """Draw factors on the uncertain numbers in some copies, each from its own stream, (numbers, len(copies))."""
         shares = np.array([self.streams[i].random(len(self._spreads)) for i in copies])
         shares = np.ascontiguousarray(shares.reshape(len(copies), len(self._spreads)).T)

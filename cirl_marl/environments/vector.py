@@ -289,9 +289,8 @@ class MultiAgentVectorEnv:
         Raises:
             ControlError: for a seed, option or state that cannot be used; the environment is left as it was.
         """
-        start = self._starts.begin(seed, options)
-        copies = range(self.num_envs)
-        self._state = self._fresh(start, self._factors(copies), self._starts.paths(copies))
+        start, factors = self._starts.begin(seed, options, uncertain=self.uncertain)
+        self._state = self._fresh(start, factors, self._starts.paths(range(self.num_envs)))
         self.episodes = self.episodes + 1
         return self.by_agent(self._observe(self._state))
 
@@ -530,9 +529,8 @@ class MultiAgentVectorEnv:
         self.episodes = self.episodes + over
         copies, last = np.flatnonzero(over), self.physical
         start = self.rows.start_of(last.stock, last.inner)
-        start[:, copies] = self._starts.draw(copies)
         factors = last.factors.copy()
-        factors[:, copies] = self._factors(copies)
+        start[:, copies], factors[:, copies] = self._starts.draw(copies, uncertain=self.uncertain)
         paths = self._starts.paths(copies)
         if len(copies) < self.num_envs and len(paths.states):
             episode = Paths(last.processes.copy(), last.disturbances.copy())
@@ -546,10 +544,6 @@ class MultiAgentVectorEnv:
         """Return the index of the next interval in each copy, shape (num_envs,); at the end that of the last."""
         step = np.zeros(self.num_envs, dtype=np.intp) if self._state is None else self._state.step
         return np.minimum(step, self.network.episode.horizon - 1)
-
-    def _factors(self, copies: range | Integers) -> Floats:
-        """Draw factors on the uncertain numbers in some copies; no rows if none are to be drawn."""
-        return self._starts.factors(copies) if self.uncertain else np.empty((0, len(copies)))
 
     def _fresh(self, start: Floats, factors: Floats, paths: Paths) -> State:
         """State at the start of an episode; flows and measures are those that neutral control would give."""

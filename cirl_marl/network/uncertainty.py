@@ -35,6 +35,8 @@ CERTAIN = (1.0, 1.0)
 """Range of the factor on a number that is certain."""
 KINDS: Mapping[str, type[Any]] = {"nodes": Node, "arcs": Arc, "services": Service}
 """Parts of a network whose numbers may be uncertain, by the key of their table."""
+CONTENT = "content."
+"""What paths of contents of initial stocks go on with, before the substance; they are drawn and not disturbed."""
 CAPACITY = "control.high"
 """What a disturbance may lower, or raise, of an actuator, as the last part of a path: its upper bound."""
 
@@ -200,6 +202,8 @@ def _undrawable(network: Specification, part: Any, name: str, path: str) -> Iter
         yield f"only a lifetime with a deviation can be stretched{' or disturbed' if disturbed else ''}"
     elif name == "stretch" and low <= 0:
         yield "some draws are 0; give a range above it"
+    elif name.startswith(CONTENT) and (mistake := _no_content(network, part, path)):
+        yield mistake
     elif name == CAPACITY and (mistake := _lost_capacity(network, part, path)):
         yield mistake
     elif low < 0:
@@ -215,6 +219,17 @@ def _undrawable(network: Specification, part: Any, name: str, path: str) -> Iter
             if (bands[0] > bands[1]).any():
                 by = f"disturbed by '{disturbed.by}': " if disturbed else ""
                 yield f"{by}some draws turn the band upside down; give ranges that do not overlap"
+
+
+def _no_content(network: Specification, node: Node, path: str) -> str:
+    """Return why the content of an initial stock cannot be drawn, or nothing."""
+    if path in network.disturbed:
+        return "what is in a stock at the start cannot be disturbed in time, but drawn"
+    most = sum(
+        extremes(part)[1] * _factor_range(network, f"nodes.{node.id}.{CONTENT}{id_}")[1]
+        for id_, part in dict(node.content).items()
+    )
+    return f"some draws of its contents sum to {most:.4g}, more than 1; give ranges" if most > 1 + ROUNDING else ""
 
 
 def _lost_capacity(network: Specification, part: Any, path: str) -> str:
@@ -421,7 +436,8 @@ def _uncertain_field(network: Specification, path: str) -> tuple[Any, str]:
     options = [
         field
         for field, declaration, _ in numbers(parts[id_])
-        if isinstance(declaration, Quantity) and declaration.varies and not declaration.past
+        if isinstance(declaration, Quantity)
+        and (field.startswith(CONTENT) or (declaration.varies and not declaration.past))
     ]
     if isinstance(parts[id_], Compartment):
         options += ["control", CAPACITY]
