@@ -80,15 +80,19 @@ def test_years_come_back_from_files_of_scenario_databases(tmp_path: Path) -> Non
             read_iamc(path)
 
 
-@pytest.mark.parametrize("name", ["city", "copper_net", "steel_japan"])
+@pytest.mark.parametrize("name", ["city", "copper_net", "steel_japan", "steel_japan.copper"])
 def test_a_data_package_has_a_network_and_its_episode(tmp_path: Path, name: str) -> None:
     """All numbers come back as they were, with a network that moves in the same way."""
-    network = city().with_options(episode={"horizon": 5}) if name == "city" else load_network(name)
+    name, _, scenario = name.partition(".")
+    network = load_network(name, scenario=scenario or None) if name != "city" else city()
+    network = network.with_options(episode={"horizon": 5})
     done = simulate(network, steps=5)
     descriptor = json.loads(write_package(tmp_path / "package", done).read_text(encoding="utf-8"))
     assert {part["name"] for part in descriptor["resources"]} >= {"nodes", "arcs", "stocks", "flows", "accounts"}
     back, run = read_package(tmp_path / "package"), done.rollout
-    assert (back.scenario, back.control) == ("default", "neutral")
+    assert (back.scenario, back.control) == (scenario or "default", "neutral")
+    np.testing.assert_array_equal(back.contents, run.contents)
+    assert len(network.substances) == (scenario == "copper")
     np.testing.assert_array_equal(back.stock, np.concatenate([run.start[None], run.stock]))
     np.testing.assert_array_equal(back.flow, run.flow)
     np.testing.assert_array_equal(back.levels, run.levels[0].T)
@@ -136,6 +140,15 @@ def test_what_nobody_books_comes_back_as_nothing(tmp_path: Path) -> None:
     (tmp_path / "package" / "flows.csv").unlink()
     with pytest.raises(CirlError, match=r"flows\.csv: no such file"):
         read_package(tmp_path / "package")
+
+
+def test_contents_stand_in_iamc_files(tmp_path: Path) -> None:
+    """Of stocks and flows, as parts of their mass."""
+    japan = simulate("steel_japan", scenario="copper", steps=2)
+    rows = {row.variable: row for row in read_iamc(write_iamc(tmp_path / "iamc.csv", [japan]))}
+    content = japan.rollout.contents[:, 0, [*japan.network.compartments].index("eaf_steel")]
+    assert rows["Content|copper|eaf_steel"].unit == "1" and content.min() > 0.002
+    assert [*rows["Content|copper|eaf_steel"].values.values()] == content.tolist()
 
 
 def test_the_command_writes_a_data_package(tmp_path: Path) -> None:

@@ -1,7 +1,8 @@
 """A network and an episode of it as a Frictionless data package: tables that say what their columns are, and a reader.
 
 The folder has ``datapackage.json``, the definition ``network.toml``, tables of nodes and arcs, and a row for each
-number of the episode: stocks at the start and after each interval, mean flows, service levels, λ, amounts on accounts.
+number of the episode: stocks at the start and after each interval, mean flows, service levels, λ, amounts on accounts,
+and of each substance the content of stocks after an interval and of flows in it.
 
 Reference: Frictionless Data, Data Package version 2 (datapackage.org).
 """
@@ -44,6 +45,7 @@ class EpisodePackage:
     levels: Annotated[Floats, "level of each service, shape (steps, services)"]
     circularity: Annotated[Floats, "mean of λ over each interval, shape (steps,), mass"]
     bookings: Annotated[Floats, "amount on each account, not discounted, shape (steps, accounts)"]
+    contents: Annotated[Floats, "part of each substance in nodes and flows, shape (steps, substances, compartments)"]
 
 
 def write_package(folder: str | Path, simulation: Simulation) -> Path:
@@ -96,6 +98,14 @@ def _tables(simulation: Simulation) -> dict[str, tuple[list[TableField], Iterabl
     head = [("id", "string", "of the network"), ("title", "string", "in pictures")]
     kinds = [("role", "string", "in the circular economy"), ("stores", "boolean", "whether it has a stock")]
     ends = [("from", "string", "node that gives"), ("to", "string", "node that receives")]
+    part = ("content", "number", "part of the mass: of a stock after the interval, of a flow in it")
+    contents = {
+        f"content_{substance.id}": (
+            [interval, ("compartment", "string", "id"), part],
+            [[t, id_, run.contents[t, s, c]] for t in steps for c, id_ in enumerate(network.compartments)],
+        )
+        for s, substance in enumerate(network.substances)
+    }
     account = [("account", "string", "id"), ("compartment", "string", "of it"), ("unit", "string", "of amounts")]
     return {
         "nodes": (
@@ -126,6 +136,7 @@ def _tables(simulation: Simulation) -> dict[str, tuple[list[TableField], Iterabl
             [interval, *account, ("amount", "number", "not discounted")],
             ([t, a.id, id_, a.unit, run.entries[t, e]] for t in steps for e, (a, id_) in enumerate(entries)),
         ),
+        **contents,
     }
 
 
@@ -159,6 +170,14 @@ def read_package(folder: str | Path) -> EpisodePackage:
         table("services", ("service", "level"), ids(network.services)),
         table("circularity", ("", "circularity"), [""])[:, 0],
         table("accounts", ("account", "amount"), ids(network.accounts)),
+        np.array(
+            [
+                table(f"content_{s}", ("compartment", "content"), [*network.compartments])
+                for s in ids(network.substances)
+            ]
+        )
+        .reshape(len(network.substances), network.episode.horizon, len(network.compartments))
+        .transpose(1, 0, 2),
     )
 
 

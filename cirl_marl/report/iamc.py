@@ -1,8 +1,9 @@
 """Episodes in the format of the Integrated Assessment Modeling Consortium, which pyam and scenario databases use.
 
 A row is a model, a scenario, a region, a variable and a unit, with a column for each year. Variables are
-``Circularity``, ``Service Level|SERVICE``, ``Stock|NODE`` at the end of a year, ``Flow|ARC``, and ``ACCOUNT`` with its
-parts ``ACCOUNT|COMPARTMENT``, not discounted. Compartments of copies stand under their region by the names there.
+``Circularity``, ``Service Level|SERVICE``, ``Stock|NODE`` at the end of a year, ``Flow|ARC``, ``Content|SUBSTANCE|
+COMPARTMENT``, a part of its mass, and ``ACCOUNT`` with its parts ``ACCOUNT|COMPARTMENT``, not discounted. Compartments
+of copies stand under their region by the names there.
 
 References: Huppmann et al. 2021, pyam: Analysis and visualisation of integrated assessment and macro-energy scenarios.
 """
@@ -165,6 +166,11 @@ def _series(network: Network, control: str) -> Iterator[YearlyRow]:
     for k, arc in enumerate(network.arcs):
         region, name = place(arc.id)
         yield row(region, f"Flow|{name}", f"{mass}/yr", at(k, lambda run, k: run.flow[:, k] * scale))
+    for s, substance in enumerate(network.substances):
+        for c, id_ in enumerate(network.compartments):
+            region, name = place(id_)
+            content = partial(_content, s, c)
+            yield row(region, f"Content|{substance.id}|{name}", "1", content)
     for a, account in enumerate(network.accounts):
         title, unit = account.title or account.id, f"{account.unit}/yr"
         yield row(own, title, unit, at(a, lambda run, a: run.bookings[0, a]))
@@ -173,6 +179,10 @@ def _series(network: Network, control: str) -> Iterator[YearlyRow]:
             parts.setdefault(place(ledger.compartments[entry]), []).append(entry)
         for (region, name), entries in parts.items():
             yield row(region, f"{title}|{name}", unit, partial(_amounts, entries))
+
+
+def _content(substance: int, compartment: int, run: Rollout) -> Floats:
+    return run.contents[:, substance, compartment]
 
 
 def _amounts(entries: list[int], run: Rollout) -> Floats:
