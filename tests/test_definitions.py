@@ -359,10 +359,19 @@ weight = { value = 1, unit = "1", source = "x" }
     assert [node.id for node in more.nodes if node not in usual.nodes] == ["exporter"]
     assert [arc.id for arc in more.arcs if arc not in usual.arcs] == ["use_to_exporter", "exported"]
     assert [service.id for service in more.services] == [*(service.id for service in usual.services), "exports"]
-    for key, needs in (('role = "tech', "role"), ('from = "use"', "from and to"), ('provider = "exp', "provider")):
+    for key, needs in (
+        ('role = "tech', "role and an arc"),
+        ('from = "use"', "from and to"),
+        ('provider = "exp', "provider"),
+    ):
         lines = [line for line in new.splitlines() if not line.startswith(key)]
         path.write_text(COPPER + "\n".join(lines), encoding="utf-8")
         with pytest.raises(DefinitionError, match=f"scenarios.more.*unknown.*A new one needs {needs}\\."):
+            load_network(path, scenario="more")
+    for more_, said in (('[scenarios.more.nodes.yous]\nrole = "landfill"', "Did you mean 'use'.*role and an arc"),
+                        ("[scenarios.more.nodes]\nyard = 3", "nodes.yard: must be a table")):  # fmt: skip
+        path.write_text(COPPER + "\n" + more_, encoding="utf-8")
+        with pytest.raises(DefinitionError, match=said):
             load_network(path, scenario="more")
 
 

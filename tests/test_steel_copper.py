@@ -33,7 +33,7 @@ def content(network: Network, run: Rollout, arc: str) -> Floats:
 def test_copper_adds_itself_to_the_masses(name: str) -> None:
     """What copper is not moves as without it, to within the part that it takes in the demand for steel in use."""
     (plain, without), (network, run) = as_usual(name, None), as_usual(name, "copper")
-    for arc in ("goods_to_use", "old_scrap", "cast"):
+    for arc in ("goods_to_use", "old_scrap"):
         expected, flow = without.flow[:, plain.arc_index[arc]], run.flow[:, network.arc_index[arc]]
         np.testing.assert_allclose(flow, expected, rtol=0.05)
 

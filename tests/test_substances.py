@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from unittest.mock import patch
 
@@ -41,12 +42,14 @@ from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network.disturbances import AutoRegression, DisturbanceEffect
 from cirl_marl.network.elements import FIXED_LIFETIME, Lifetime
-from cirl_marl.network.series import extremes
+from cirl_marl.network.series import Series, extremes
 from cirl_marl.network.substances import follows_contents
 from cirl_marl.network.uncertainty import Spread, draw_network
 from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.draw_proofs import Sampling
 from cirl_marl.optimum.linearised import jacobians, step_program
 from cirl_marl.optimum.program import LARGE
+from cirl_marl.reasons.prices import shadow_prices
 
 substances_networks = st.builds(
     lambda seed, nodes, arcs, lifetimes: with_substances(random_network(seed, nodes, arcs, lifetimes=lifetimes), seed),
@@ -708,6 +711,89 @@ def test_no_episode_with_its_contents_is_above_their_bound(
         limit = bound(network, degree=degree, min_service=np.maximum(run.episode_levels[0] - 1e-7, 0.0))
     size = network.objective.reference_interval * float(np.abs(run.flow).sum(axis=1).max())
     assert run.episode_circularity[0] <= limit.objective + 1e-8 * (1.0 + abs(limit.objective) + size)
+
+
+def two_stocks(*shares: Arc, initial: tuple[float, float] = (0.0, 0.0), content: float = 0.0) -> Network:
+    """Return a network in which a stock hands on copper in shares, and another one is emptied by orders."""
+    order = Control(kind=ControlKind.FLOW, low=0.0, neutral=0.0, high=5.0)
+    served = Service(id="served", provider="bc", quantity="flow", low=1.0, weight=1.0, owed_by=("bc",))
+    return Network(
+        name="two_stocks",
+        nodes=(
+            Node(id="a", initial=(100.0, 100.0), rate=0.5, content={"copper": 0.3}),
+            Node(id="b", initial=initial, content={"copper": content}),
+            Node(id="c", role=Role.LANDFILL, initial=(0.0, 0.0)),
+        ),
+        arcs=(
+            *shares,
+            Arc(id="ac", donor="a", recipient="c", law=Law.SHARE),
+            Arc(id="bc", donor="b", recipient="c", law=Law.CONTROLLED, control=order),
+        ),
+        services=(served, replace(served, id="clean", substance="copper", low=0.0, high=0.24)),
+        substances=COPPER,
+        mass_unit="t",
+        time_unit="year",
+        episode=Episode(control_interval=1.0, horizon=2),
+    )
+
+
+def shares_beside_a_sorter() -> tuple[Arc, ...]:
+    """Return a share that anybody sets, of which a sorter leaves less of the copper than of all else."""
+    share = Control(kind=ControlKind.SHARE, low=0.0, neutral=0.0, high=0.5)
+    sorter = Control(kind=ControlKind.TRANSFER, low=0.0, neutral=0.0, high=0.9, substances=("copper",))
+    return (
+        Arc(id="ab", donor="a", recipient="b", law=Law.SHARE, control=share),
+        Arc(id="ax", donor="a", recipient="c", law=Law.SHARE, share=0.1, control=sorter),
+    )
+
+
+def shares_that_cross() -> tuple[Arc, ...]:
+    """Return shares of the same range, at other times."""
+    rising, falling = (Series(times=(0.0, 1.0), values=values) for values in ((0.1, 0.5), (0.5, 0.1)))
+    return (Arc(id="ab", donor="a", recipient="b", law=Law.SHARE, share=rising, transfer={"copper": falling}),)
+
+
+@pytest.mark.parametrize("shares", [shares_beside_a_sorter(), shares_that_cross()])
+def test_ranges_that_are_alike_are_not_the_same_shares(shares: tuple[Arc, ...]) -> None:
+    """What has other shares of copper may have another content, though each may be anywhere in the same range."""
+    network = two_stocks(*shares)
+    run = simulate_plan(replace(bound(network), actions=np.ones((2, len(network.agents)))))
+    limit = bound(network, min_service=np.maximum(run.episode_levels[0] - 1e-6, 0.0))
+    assert run.episode_circularity[0] <= limit.objective + 1e-9
+
+
+def test_bounds_are_of_the_contents_at_their_start() -> None:
+    """A stock that is empty by definition has its content where it is not; what it cannot have is refused."""
+    network = two_stocks(*shares_that_cross(), content=0.6)
+    start = bound(network, {"b": 50.0}).initial.copy()
+    for initial in ({"b": 50.0}, start):
+        found = bound(network, initial, min_service=[0.99, 0.3])
+        assert found.levels[0] >= 0.99 - 1e-6
+    assert start.tolist() == pytest.approx([70, 20, 0, 30, 30, 0])  # what is no copper of each stock, then copper
+    start[[1, 4]] = 5.0, 45.0
+    message = r"initial: 0\.9 of 'b' is copper; by its content, and by what enters it, 0\.\d+ to 0\.\d+ may be"
+    for ask in (partial(bound, network, start), partial(found.at, start)):
+        with pytest.raises(CirlError, match=message):
+            ask()
+
+
+@pytest.mark.medium
+def test_uncertain_bounds_start_with_the_contents_that_are_drawn() -> None:
+    """Whether the start is given or not, as the simulator does."""
+    network = replace(
+        two_stocks(*shares_that_cross(), initial=(50.0, 50.0), content=0.3),
+        uncertain={"nodes.b.content.copper": Spread(low=0.5, high=2.0, distribution="uniform")},
+    )
+    sampling = Sampling(draws=16, fit_draws=4)
+    limits = [bound(network, start, min_service=[0.99, 0.0], uncertain=sampling) for start in (None, {"b": 50.0})]
+    assert limits[0].value == pytest.approx(limits[1].value, rel=1e-9)
+
+
+@pytest.mark.medium
+def test_prices_of_a_network_with_contents() -> None:
+    """Of what nobody demands yet, a grade, too; more demand brings nothing."""
+    prices = shadow_prices(load_network(EXAMPLE).with_options(episode={"horizon": 4}), min_service=0.9)
+    assert np.isfinite(prices.demand).all() and (prices.demand[:, :2] <= 1e-9).all()
 
 
 def test_plans_order_the_whole_of_a_flow() -> None:

@@ -75,12 +75,19 @@ def path_mistakes(document: Mapping[str, Any], paths: Any, prefix: str) -> Itera
 
 def stranger_mistakes(document: Mapping[str, Any], override: Mapping[str, Any], prefix: str) -> Iterator[str]:
     """Yield the nodes, arcs and services that a scenario changes but ``document`` does not have."""
+    tables = [table.get("arcs", {}) for table in (document, override)]
+    arcs = [arc for table in tables if isinstance(table, Mapping) for arc in table.values() if isinstance(arc, Mapping)]
+    ends = [arc.get(end) for arc in arcs for end in ("from", "to")]
     for part, keys in WHOLE.items():
         names, changes = document.get(part, {}), override.get(part, {})
         if not isinstance(changes, Mapping) or not isinstance(names, Mapping):
             yield f"{prefix}{part}: must be a table"
             continue
         for name, change in changes.items():
-            is_new = isinstance(change, Mapping) and all(key in change for key in keys)
-            if name not in names and not is_new:
-                yield f"{prefix}{part}: {unknown_name(part[:-1], name, names)} A new one needs {' and '.join(keys)}."
+            if name in names:
+                continue
+            if not isinstance(change, Mapping):
+                yield f"{prefix}{part}.{name}: must be a table"
+            elif not all(key in change for key in keys) or (part == "nodes" and name not in ends):
+                needs = " and ".join((*keys, *(["an arc"] if part == "nodes" else [])))
+                yield f"{prefix}{part}: {unknown_name(part[:-1], name, names)} A new one needs {needs}."

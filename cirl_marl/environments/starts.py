@@ -112,12 +112,12 @@ class Starts:
     def _drawn_spread(self, node: str, factors: Floats) -> Floats:
         """Return the part of a stock that is in each of its rows, with the contents that were drawn, (rows, 1 or B)."""
         spread = self._spread[node][:, None]
-        drawn = [(part, numbers[node]) for part, numbers in self._uncertain_contents if node in numbers]
-        if not drawn or not len(factors):
+        entries = [(part, numbers[node]) for part, numbers in self._uncertain_contents if node in numbers]
+        if not entries or not len(factors):
             return spread
         parts = np.repeat(spread, factors.shape[1], axis=1).reshape(self._components, -1, factors.shape[1])
         whole = parts.sum(axis=0)
-        for part, number in drawn:
+        for part, number in entries:
             parts[part] *= factors[number]
         parts[0] = np.maximum(whole - parts[1:].sum(axis=0), 0.0)
         return parts.reshape(-1, factors.shape[1])

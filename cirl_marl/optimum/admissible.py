@@ -78,10 +78,10 @@ class Admissible:
     mixtures: Annotated[Mixtures | None, "scheduled flows of components; None if contents are not followed"]
 
     @classmethod
-    def of(cls, network: Network, agents: Sequence[str] | None = None, content: Floats | None = None) -> Admissible:
+    def of(cls, network: Network, agents: Sequence[str] | None = None, like: Mixtures | None = None) -> Admissible:
         """Read the ranges off ``network`` while ``agents`` act and the others are neutral.
 
-        Of one that is written by components already the ``content`` of scheduled flows is given (``Mixtures``).
+        One that is written by components already has the contents of another, which it is ``like``.
 
         Raises:
             NoCertificate: for inner physics, batches, or a solver that is not exact.
@@ -112,8 +112,8 @@ class Admissible:
             compartment = _setter(network, arc)
             if compartment is not None:
                 setting[:, :, k] = _control_range(network, compartment, agents)
-        limited = np.array([bool(arc.capacity_node) for arc in network.arcs], dtype=bool)
-        setting[0][:, limited] = 0.0  # as long as nothing is built they carry nothing
+        has_capacity = np.array([bool(arc.capacity_node) for arc in network.arcs], dtype=bool)
+        setting[0][:, has_capacity] = 0.0  # as long as nothing is built they carry nothing
         with_capacity = [arc for arc in network.arcs if arc.capacity_node and network.original(arc.id) == arc.id]
         capacity_arcs = np.array([network.arc_index[arc.id] for arc in with_capacity], dtype=np.intp)
         split_arcs = network.splits
@@ -128,7 +128,7 @@ class Admissible:
         base = np.array(coefficients, dtype=float).reshape(-1, steps).T
         mixtures = None
         if isinstance(network, ComponentNetwork):
-            mixtures = _mixtures(lifetimes, setting, valve, base, content)
+            mixtures = _mixtures(lifetimes, setting, valve, base, like)
         service_low = [network.interval_means(service.low) for service in network.services]
         return cls(
             network=network,
@@ -280,23 +280,25 @@ def share_ranges(split: Split, wishes: Floats) -> Floats:
     return np.concatenate([low + over * cut, rest[:, None] * split.proportions], axis=1)
 
 
-def _mixtures(lifetimes: Lifetimes, setting: Floats, valve: Floats, base: Floats, content: Floats | None) -> Mixtures:
+def _mixtures(lifetimes: Lifetimes, setting: Floats, valve: Floats, base: Floats, like: Mixtures | None) -> Mixtures:
     """Return the scheduled flows of components, and give those of each the part of ``setting`` that it can have."""
     network, plan_network = lifetimes.network, lifetimes.plan_network
     # written by components it has the same arcs first, then those within lifetimes, then copies
-    whole_arcs = network.arcs if content is None else network.arcs[: content.shape[2]]
+    whole_arcs = network.arcs if like is None else network.arcs[: like.arcs.shape[1]]
     arcs = np.array([[plan_network.arc_index[id_] for id_ in plan_network.components_of(k.id)] for k in whole_arcs])
     arcs = arcs.astype(np.intp).reshape(-1, 1 + len(network.substances)).T
-    if content is None:
+    if like is not None:
+        content, stocks = like.content, like.stocks
+    else:
         shares, by_share = np.ones((2, *arcs.shape)), [arc.law is Law.SHARE for arc in whole_arcs]
         shares[0][:, by_share] = setting[0].min(axis=0)[arcs[:, by_share]]
         shares[1][:, by_share] = setting[2].max(axis=0)[arcs[:, by_share]]
-        content = content_ranges(network, shares)
+        content, stocks = content_ranges(network, shares)
     scheduled = np.flatnonzero([LAWS[arc.law].is_scheduled for arc in whole_arcs])
-    asked = (setting * valve[:, :, plan_network.donors] * base)[::2][:, :, arcs[0, scheduled]]
+    orders = (setting * valve[:, :, plan_network.donors] * base)[::2][:, :, arcs[0, scheduled]]
     for (low, high), of_component in zip(content.transpose(1, 0, 2)[:, :, scheduled], arcs[:, scheduled], strict=True):
         setting[:, :, of_component] *= np.stack([low, (low + high) / 2, high])[:, None]
-    return Mixtures(arcs, content, scheduled, asked)
+    return Mixtures(arcs, content, stocks, scheduled, orders)
 
 
 def _sets_transfer(arc: Arc) -> bool:

@@ -7,10 +7,14 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from cirl_marl.dynamics.state_layout import StateLayout
+from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import positional_record
-from cirl_marl.network.substances import contents
+from cirl_marl.network.substances import contents, separates
 
+ROUND_OFF = 1e-6
+"""What a part of a stock may be off, as simulators round, and part of all stocks that is as good as none."""
 SETTLED, ROUNDS = 1e-12, 1000
 """Change of a range in a round that counts as none, and rounds after which what still changes may be anything."""
 
@@ -21,8 +25,9 @@ class Mixtures:
 
     arcs: Annotated[Integers, "of the planned network, shape (components, arcs)"]
     content: Annotated[Floats, "least and greatest part of each component, shape (2, components, arcs)"]
+    stocks: Annotated[Floats, "likewise of the stocks, shape (2, components, stores)"]
     scheduled: Annotated[Integers, "which of the arcs flow by schedule"]
-    asked: Annotated[Floats, "least and most asked of the whole of these, shape (2, steps, scheduled), mass/time"]
+    orders: Annotated[Floats, "least and most asked of the whole of these, shape (2, steps, scheduled), mass/time"]
 
     @property
     def varies(self) -> NDArray[np.bool_]:
@@ -30,8 +35,8 @@ class Mixtures:
         return np.asarray((self.content[0] < self.content[1]).any(axis=0))
 
 
-def content_ranges(network: Network, shares: Floats) -> Floats:
-    """Return what part of each flow each component may be, at any time and whatever agents do.
+def content_ranges(network: Network, shares: Floats) -> tuple[Floats, Floats]:
+    """Return what part of each flow, and of each stock, each component may be at any time, whatever agents do.
 
     Stocks begin with their content and mix what enters; what a node hands on in shares that differ by component has
     s_c·x_c of Σ s·x. The ranges are the least that contain the start and reproduce themselves.
@@ -42,15 +47,17 @@ def content_ranges(network: Network, shares: Floats) -> Floats:
             (2, components, arcs).
 
     Returns:
-        Least and greatest part, shape (2, components, arcs); from 1 to 0 where nothing ever flows.
+        Least and greatest part, shapes (2, components, arcs) and (2, components, stores); from 1 to 0 of flows that
+        there never are.
     """
-    count = 1 + len(network.substances)
-    ranges = np.tile([[[1.0]], [[0.0]]], (1, count, len(network.nodes)))
+    is_separate = np.zeros(len(network.arcs), dtype=bool)
+    for split in network.splits:
+        is_separate[[*split.controlled_arcs, *split.other_arcs]] = separates(network, split)
+    ranges = np.tile([[[1.0]], [[0.0]]], (1, 1 + len(network.substances), len(network.nodes)))
     for i, node in enumerate(network.stores):
-        if network.initial[1, i] > 0:
-            ranges[:, :, i] = contents(network, node)
+        ranges[:, :, i] = contents(network, node)
     for done in range(ROUNDS + len(network.nodes)):
-        flows = _handed_on(ranges[:, :, network.donors], shares)
+        flows = _handed_on(ranges[:, :, network.donors], shares, is_separate)
         wider = ranges.copy()
         np.minimum.at(wider[0].T, network.recipients, flows[0].T)
         np.maximum.at(wider[1].T, network.recipients, flows[1].T)
@@ -62,17 +69,42 @@ def content_ranges(network: Network, shares: Floats) -> Floats:
             ranges[0][:, changed], ranges[1][:, changed] = 0.0, 1.0
     changes = ranges[0] != ranges[1]
     margin = np.array([-1e-9, 1e-9])[:, None, None] * changes  # of rounding, and what was too little to have settled
-    flows = _handed_on((ranges + margin).clip(0.0, 1.0)[:, :, network.donors], shares)
-    return flows
+    ranges = (ranges + margin).clip(0.0, 1.0)
+    return _handed_on(ranges[:, :, network.donors], shares, is_separate), ranges[:, :, : len(network.stores)]
 
 
-def _handed_on(content: Floats, shares: Floats) -> Floats:
+def check_contents(network: Network, mixtures: Mixtures, rows: StateLayout, initial: Floats) -> None:
+    """Refuse stocks at the start whose contents are none that programs allow for.
+
+    Args:
+        network: whose stocks they are.
+        mixtures: what programs allow for.
+        rows: which stock of the simulator is what.
+        initial: stocks of the simulator, shape (stocks,), mass.
+
+    Raises:
+        CirlError: naming the node, the substance and what it may be of the stock.
+    """
+    names = [substance.id for substance in network.substances]
+    for i, node in enumerate(network.stores):
+        masses = initial[rows.stages[i].reshape(1 + len(names), -1)]
+        whole = masses.sum(axis=0)
+        there = whole > ROUND_OFF * initial.sum()
+        parts = masses[1:, there] / whole[there]
+        for name, part, low, high in zip(names, parts, *mixtures.stocks[:, 1:, i], strict=True):
+            wrong = part[(part < low - ROUND_OFF) | (part > high + ROUND_OFF)]
+            if len(wrong):
+                fault = f"by its content, and by what enters it, {low:.4g} to {high:.4g} may be"
+                raise CirlError(f"initial: {wrong[0]:.4g} of '{node.id}' is {name}; {fault}")
+
+
+def _handed_on(content: Floats, shares: Floats, is_separate: NDArray[np.bool_]) -> Floats:
     """Return the ranges of contents of flows, of those of their donors and the shares of each component."""
     (low, high), (least, most) = content, shares
-    separated = (shares != shares[:, :1]).any(axis=(0, 1)) & (low <= high).all(axis=0)
+    is_separate = is_separate & (low <= high).all(axis=0)
     result = content.copy()
     for side, part, own, others in ((0, low, least, most.max(axis=0)), (1, high, most, least.min(axis=0))):
         gain, rest = own * part, (1.0 - part) * others
         edge = np.divide(gain, gain + rest, out=np.full_like(gain, float(side)), where=gain + rest > 0)
-        result[side][:, separated] = edge[:, separated]
+        result[side][:, is_separate] = edge[:, is_separate]
     return result

@@ -12,9 +12,11 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.innovations import innovations
+from cirl_marl.network.uncertainty import CONTENT
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.aims import NO_AIMS, Aims, account_rows
 from cirl_marl.optimum.certificate import Certificate, verify
+from cirl_marl.optimum.options import by_stage
 from cirl_marl.optimum.program import Program, Programs
 from cirl_marl.optimum.solver import Basis, Infeasible, SolverFailure, solve
 from cirl_marl.optimum.stock_values import stock_values
@@ -39,14 +41,23 @@ class Draw:
 
 
 def draws_of(env: MultiAgentVectorEnv, initial: Floats | None = None) -> list[Draw]:
-    """Return what the episodes in the copies of an environment draw; with ``initial`` all start from there."""
+    """Return what the episodes in the copies of an environment draw; with ``initial`` all start from there.
+
+    Where contents are drawn, ``initial`` says the mass of each stock alone.
+    """
     state, last = env.physical, env.network.episode.horizon
     processes = env.network.processes
     parts = innovations(processes, state.processes[:last] if processes.names else np.empty((last, 0, env.num_envs)))
     starts = state.stock[env.rows.nodes].T.copy()
+    networks = [env.certain_network(i) for i in range(env.num_envs)]
+    if initial is not None:
+        starts[:] = initial
+    if initial is not None and any(f".{CONTENT}" in path for path in env.network.uncertain):
+        masses = env.rows.stocks(initial[:, None])[:, 0]
+        starts = np.array([by_stage(network, env.rows, masses) for network in networks])
     return [
-        Draw(env.certain_network(i), start if initial is None else initial, parts.features[..., i], parts.new[..., i])
-        for i, start in enumerate(starts)
+        Draw(network, start, parts.features[..., i], parts.new[..., i])
+        for i, (network, start) in enumerate(zip(networks, starts, strict=True))
     ]
 
 

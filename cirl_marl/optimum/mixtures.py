@@ -46,7 +46,7 @@ def mixture_rows(admissible: Admissible, reach: Reach, intervals: range, rows: P
     for place, k in enumerate(mixtures.scheduled.tolist()):
         if not (several[k] and is_free[k]):
             continue
-        arcs, (least, most) = mixtures.arcs[:, k], mixtures.asked[:, period, place]
+        arcs, (least, most) = mixtures.arcs[:, k], mixtures.orders[:, period, place]
         delivered = reach.delivered[:, arcs].min(axis=1)
         for side, sign, limit in ((0, 1.0, most), (1, -1.0, -least * delivered)):
             row = rows.add(3, 1, k, t, moments, side)
@@ -79,11 +79,13 @@ def content_rows(admissible: Admissible, high: Floats, intervals: range, rows: P
         columns = np.flatnonzero(whole)
         bands = admissible.service_low[period, s], network.interval_means(service.high)[period]
         for side, sign, end in ((0, -1.0, bands[0]), (1, 1.0, bands[1])):
-            if not ((end > 0) & (end < math.inf)).any():
+            if side and not (end < math.inf).any():  # grades have a row even so, as others may ask for more
                 continue
-            most = high @ own if side else end * (high @ whole)
+            finite = end < math.inf
+            end = np.where(finite, end, 0.0)
+            most = finite * (high @ own) if side else end * (high @ whole)
             row = rows.add(4, s, t, side)
-            excess = sign * (own[columns] - end[:, None] * whole[columns])
+            excess = sign * (finite[:, None] * own[columns] - end[:, None] * whole[columns])
             rows.put(row[:, None], t[:, None] * layout.size + columns, excess)
             rows.put(row, t * layout.size + layout.level + s, most)
             rows.limit(row, most)

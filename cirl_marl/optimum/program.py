@@ -32,6 +32,7 @@ from cirl_marl.optimum.constraints import (
     throughputs,
     valve_envelopes,
 )
+from cirl_marl.optimum.content_ranges import check_contents
 from cirl_marl.optimum.matrices import BEFORE, NOW, ChainedRows, IntervalCache, Layout, ProgramRows, RowParts
 from cirl_marl.optimum.mixtures import content_rows, mixture_rows
 from cirl_marl.optimum.quasi_steady import decay_rows, end_laws, has_fast_stocks, quasi_steady_rows
@@ -120,10 +121,9 @@ class Programs:
         self.admissible, lifetimes = admissible, admissible.lifetimes
         has_lifetimes = lifetimes.plan_network is not lifetimes.reach_network
         if system is None:
-            content = None if admissible.mixtures is None else admissible.mixtures.content
             chain_form = admissible
             if has_lifetimes:
-                chain_form = Admissible.of(lifetimes.reach_network, admissible.agents, content)
+                chain_form = Admissible.of(lifetimes.reach_network, admissible.agents, admissible.mixtures)
             system = ComparisonSystem(chain_form, cache)
         self.system = system
         constant_shares = constant_shares and not hold_controls and layout is None
@@ -203,10 +203,13 @@ class Programs:
 
         Raises:
             NoCertificate: if recipients may pull more from a node than it holds.
+            CirlError: for contents that the network never has.
         """
         layout, admissible, network = self.layout, self.admissible, self.admissible.network
         intervals = range(network.episode.horizon) if intervals is None else intervals
         steps, period, lifetimes = len(intervals), slice(intervals.start, intervals.stop), admissible.lifetimes
+        if admissible.mixtures is not None:
+            check_contents(lifetimes.network, admissible.mixtures, lifetimes.state_layout, initial)
         reach, lifetime_flow = _reach(lifetimes, self.system, initial, intervals)
         changes, mixtures = ~reach.uncut, admissible.mixtures
         if mixtures is not None:

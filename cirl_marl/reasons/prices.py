@@ -16,6 +16,7 @@ from cirl_marl.network.elements import Arc, Node
 from cirl_marl.network.series import in_intervals
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.bounds import Bound, bound, highest_service
+from cirl_marl.optimum.options import by_stage
 from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.sensitivity import changes, resting_on_rows
 from cirl_marl.optimum.stock_values import stock_values
@@ -117,9 +118,12 @@ def shadow_prices(
 
 def _slope(best: Bound, admissible: Admissible, variant: Admissible) -> Floats:
     """Return the rise of λ̄ by interval with the program of a variant of what is admissible."""
-    initial, network = best.initial.copy(), best.network
     # a source without a known reserve starts with all that may be asked of it
-    initial[: len(network.stores)] += (variant.lifetimes.network.initial - network.initial).mean(axis=0)
+    before, after = (
+        by_stage(network, admissible.lifetimes.state_layout, network.initial.mean(axis=0))
+        for network in (best.network, variant.lifetimes.network)
+    )
+    initial = best.initial + after - before
     program = Programs(variant, best.degree, None).program(initial, best.min_service)
     return changes(best, admissible, program)
 
