@@ -13,8 +13,8 @@ from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.substances import contents, separates
 
-ROUND_OFF = 1e-6
-"""What a part of a stock may be off, as simulators round, and part of all stocks that is as good as none."""
+ROUND_OFF = 1e-9
+"""Part of all stocks that one of them may have too much or too little of a component, as simulators round."""
 SETTLED, ROUNDS = 1e-12, 1000
 """Change of a range in a round that counts as none, and rounds after which what still changes may be anything."""
 
@@ -89,13 +89,12 @@ def check_contents(network: Network, mixtures: Mixtures, rows: StateLayout, init
     for i, node in enumerate(network.stores):
         masses = initial[rows.stages[i].reshape(1 + len(names), -1)]
         whole = masses.sum(axis=0)
-        there = whole > ROUND_OFF * initial.sum()
-        parts = masses[1:, there] / whole[there]
-        for name, part, low, high in zip(names, parts, *mixtures.stocks[:, 1:, i], strict=True):
-            wrong = part[(part < low - ROUND_OFF) | (part > high + ROUND_OFF)]
-            if len(wrong):
+        for name, mass, low, high in zip(names, masses[1:], *mixtures.stocks[:, 1:, i], strict=True):
+            off = np.maximum(low * whole - mass, mass - high * whole)
+            worst = int(off.argmax())
+            if off[worst] > ROUND_OFF * initial.sum():
                 fault = f"by its content, and by what enters it, {low:.4g} to {high:.4g} may be"
-                raise CirlError(f"initial: {wrong[0]:.4g} of '{node.id}' is {name}; {fault}")
+                raise CirlError(f"initial: {mass[worst] / whole[worst]:.4g} of '{node.id}' is {name}; {fault}")
 
 
 def _handed_on(content: Floats, shares: Floats, is_separate: NDArray[np.bool_]) -> Floats:
