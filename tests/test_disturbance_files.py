@@ -79,7 +79,7 @@ def test_capacities_in_files(tmp_path: Path) -> None:
     for part, message in (
         ("arcs.tails", "a control of kind 'share' has no capacity: shares are parts of a whole"),
         ("arcs.leak", "arcs.leak.control.high: it has no control"),
-        ("services.metal_kept", "of services these can be uncertain or disturbed: low, high; 'control.high' cannot"),
+        ("services.metal_kept", "unknown number of services that can be .* Did you mean 'high'. Known: low, high"),
     ):
         with pytest.raises(NetworkError, match=message):
             replace(shares, disturbed={f"{part}.{CAPACITY}": DisturbanceEffect(by="outage")})
@@ -150,7 +150,7 @@ def test_mistakes_of_disturbances_are_named(changes: dict[str, Disturbance], mes
     ("disturbed", "correlation", "message"),
     [
         ({"arcs.dig.flow": DisturbanceEffect(by="prise")}, None, "arcs.dig.flow: disturbed_by: .*Did you mean 'price'"),
-        ({"arcs.dig.flw": DisturbanceEffect(by="price")}, None, "of arcs these can be uncertain or disturbed"),
+        ({"arcs.dig.flw": DisturbanceEffect(by="price")}, None, "uncertain or disturbed 'flw'. Did you mean 'flow'"),
         ({"arcs.leak.flow": DisturbanceEffect(by="price")}, None, "arcs.leak.flow: it is 0"),
         (
             {"nodes.store.stretch": DisturbanceEffect(by="price")},

@@ -213,7 +213,7 @@ def test_what_cannot_spread_is_refused(written: str, said: str, tmp_path: Path) 
     [
         (
             "arcs.dig.flw",
-            r"can be uncertain or disturbed: rate, share, flow, capacity_rate, control, control.high; 'flw'",
+            r"unknown number of arcs that can be uncertain or disturbed 'flw'\. Did you mean 'flow'\? Known: rate",
         ),
         ("arcs.dig.control", r"'control' is not given"),
         ("arcs.dg.flow", r"unknown arc 'dg'. Did you mean 'dig'"),

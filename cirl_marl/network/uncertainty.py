@@ -442,7 +442,7 @@ def _uncertain_field(network: Specification, path: str) -> tuple[Any, str]:
     if isinstance(parts[id_], Compartment):
         options += ["control", CAPACITY]
     if name not in options:
-        raise KeyError(f"of {kind} these can be uncertain or disturbed: {', '.join(options)}; '{name}' cannot")
+        raise KeyError(unknown_name(f"number of {kind} that can be uncertain or disturbed", name, options))
     if name == CAPACITY and parts[id_].control is None:
         raise KeyError("it has no control")
     if _number(parts[id_], name) is None:
