@@ -131,14 +131,27 @@ def test_a_demanded_level_is_worth_its_shadow_price(network: str) -> None:
     assert found.distance < 1e-4
 
 
-def test_set_points_bend() -> None:
+def through_a_yard(network: Network) -> Network:
+    """Return the ladder with what is supplied, and its set-point, passing a node without stock."""
+    supply = network.arcs[0]
+    yard = Node(id="yard", stores=False, set_point=supply.set_point, scale=supply.scale)
+    arcs = (
+        replace(supply, recipient="yard", set_point=None, scale=1.0),
+        Arc(id="on", donor="yard", recipient="shop", law=Law.SHARE),
+    )
+    return replace(network, nodes=(*network.nodes, yard), arcs=arcs)
+
+
+@pytest.mark.parametrize("passes", [False, True])
+def test_set_points_bend(passes: bool) -> None:
     """The flow f = p − w₁ s²/(2 w₂) is best for −w₁ f − w₂ ((f − p)/s)²: a plan tells the ratio."""
     network = replace(ladder(steps=4, set_point=5.0, scale=2.0), services=())
+    if passes:
+        network = through_a_yard(network)
     flow = 3.0
     stock = np.cumsum(np.full(4, flow))
-    made = PlannedEpisode(
-        "by hand", np.array([1000.0, 0.0]), np.stack([1000 - stock, stock], axis=1), np.full((4, 1), flow)
-    )
+    flows = np.full((4, len(network.arcs)), flow)
+    made = PlannedEpisode("by hand", np.array([1000.0, 0.0]), np.stack([1000 - stock, stock], axis=1), flows)
     found = infer(network, made, within=0.0)
     assert [each.kind for each in found.terms] == ["circularity", "set-points"]
     # 3 = 5 − w₁ · 4/(2 w₂), so w₂ = w₁
