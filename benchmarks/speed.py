@@ -448,24 +448,8 @@ def accelerator() -> list[Figure]:
         recipe = recipe.model_copy(update={"run": recipe.run.model_copy(update={"evaluations": 0, "price_rate": 0.0})})
         steps = 4 * recipe.run.envs * int(recipe.learner.parameters["n_steps"])
         learnt: dict[str, torch.Tensor] = {}
-
-        def seconds(
-            device: str,
-            recipe: Recipe = recipe,
-            seeds: int = seeds,
-            steps: int = steps,
-            learnt: dict[str, torch.Tensor] = learnt,
-        ) -> float:
-            began = time.perf_counter()
-            trainings = train_seeds("copper_net", recipe, seeds=range(seeds), steps=steps, device=device)
-            cost = time.perf_counter() - began
-            policies = [learner.model.policy for learner in trainings[0].learners.values()]
-            learnt[device] = torch.cat(
-                [weights.detach().cpu().flatten() for each in policies for weights in each.parameters()]
-            )
-            return cost
-
-        core, chip = _interleaved(1, partial(seconds, "cpu"), partial(seconds, "cuda"))
+        train_on = partial(_training_seconds, recipe, seeds, steps, learnt)
+        core, chip = _interleaved(1, partial(train_on, "cpu"), partial(train_on, "cuda"))
         ratio = median(a / b for a, b in zip(core, chip, strict=True))
         apart = float((learnt["cpu"] - learnt["cuda"]).abs().max())
         what = (
@@ -484,6 +468,16 @@ MEASURES: dict[Measurement, Callable[[], list[Figure]]] = dict(
         strict=True,
     )
 )
+
+
+def _training_seconds(recipe: Recipe, seeds: int, steps: int, learnt: dict[str, torch.Tensor], device: str) -> float:
+    """Train seeds of copper_net on a device, put their weights into ``learnt``, and return seconds."""
+    began = time.perf_counter()
+    trainings = train_seeds("copper_net", recipe, seeds=range(seeds), steps=steps, device=device)
+    cost = time.perf_counter() - began
+    policies = [learner.model.policy for learner in trainings[0].learners.values()]
+    learnt[device] = torch.cat([weights.detach().cpu().flatten() for each in policies for weights in each.parameters()])
+    return cost
 
 
 def _interleaved(rounds: int, *blocks: Callable[[], float]) -> list[list[float]]:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from small_networks import city, with_lambda
 from test_capacities import power
 from typer.testing import CliRunner
@@ -31,9 +32,9 @@ from cirl_marl.cli import app
 from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.network.disturbances import AutoRegression, DisturbanceEffect
-from cirl_marl.optimum import bound, improve, improve_plan, simulate_plan, smooth, smooth_plan
+from cirl_marl.optimum import Bound, bound, improve, improve_plan, simulate_plan, smooth, smooth_plan
 from cirl_marl.optimum.aims import Aims, Budget
-from cirl_marl.optimum.linearised import jacobians, step_program
+from cirl_marl.optimum.linearised import StepProgram, jacobians, step_program
 from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.solver import Basis
 from cirl_marl.optimum.window_planner import WindowPlanner
@@ -329,6 +330,19 @@ def test_multipliers_of_a_budget_hold_at_other_starts() -> None:
         assert float(found.at()) == pytest.approx(found.objective, rel=1e-9)
 
 
+def small_step(solved: Bound, level: float) -> tuple[Bound, StepProgram, NDArray[np.float64], Rollout, Rollout]:
+    """Return a plan of drawn actions, the program of a step from it, a small one, and episodes without and with it."""
+    rng, dynamics = np.random.default_rng(0), Dynamics(solved.network)
+    middle = replace(solved, actions=rng.uniform(-0.5, 0.5, solved.actions.shape))
+    run, services = simulate_plan(middle), len(solved.network.services)
+    prices = np.ones(services + len(solved.aims.limits))
+    program = step_program(middle, dynamics, run, np.full(services, level), prices, 0.1, jacobians(middle, dynamics))
+    moves = np.zeros(len(program.origin))
+    moves[program.action] = 1e-4 * rng.uniform(-1, 1, program.action.shape)
+    trial = simulate_plan(replace(middle, actions=middle.actions + moves[program.action]))
+    return middle, program, moves, run, trial
+
+
 def test_a_step_of_a_plan_knows_what_it_books() -> None:
     """To first order the program of a step has the account that is kept low, and the budget, as the simulator does."""
     network = city()
@@ -336,13 +350,7 @@ def test_a_step_of_a_plan_knows_what_it_books() -> None:
     nodes = tuple(replace(n, holding={"cost": 5.0}) if n.holding else n for n in network.nodes)
     network = replace(network, nodes=nodes)
     solved = bound(network, aim="cost", min_service=0.9, at_most={"emissions": 3000.0})
-    rng, dynamics = np.random.default_rng(0), Dynamics(network)
-    middle = replace(solved, actions=rng.uniform(-0.5, 0.5, solved.actions.shape))
-    run = simulate_plan(middle)
-    program = step_program(middle, dynamics, run, np.array([0.9]), np.ones(2), 0.1, jacobians(middle, dynamics))
-    moves = np.zeros(len(program.origin))
-    moves[program.action] = 1e-4 * rng.uniform(-1, 1, program.action.shape)
-    trial = simulate_plan(replace(middle, actions=middle.actions + moves[program.action]))
+    middle, program, moves, run, trial = small_step(solved, 0.9)
     books = trial.accounts[0] - run.accounts[0]
     row = program.problem.under[[len(program.problem.under_to) - 1]].toarray()[0]
     assert program.problem.cost @ moves == pytest.approx(books[0], rel=1e-3)

@@ -66,7 +66,7 @@ def test_the_world_bears_its_copper_until_2050() -> None:
 
 @pytest.mark.slow
 def test_the_plan_of_japan_keeps_copper_and_comes_to_the_bound() -> None:
-    """At full service, of contents too; without limits it would have too much in flat steel."""
+    """At full service, of contents too."""
     limit = bound("steel_japan", scenario="copper", min_service=1.0)
     run = simulate_plan(improve_plan(limit, starts=1))
     assert float(gap(limit.objective, run.episode_circularity[0])) < 0.002

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from small_networks import ACCOUNTS, booked, city, small
-from test_budgets import first_window
+from test_budgets import first_window, small_step
 from test_optimum import bounded, pinned
 from typer.testing import CliRunner
 
@@ -35,10 +35,8 @@ from cirl_marl import (
 from cirl_marl.cli import app
 from cirl_marl.controllers import Random
 from cirl_marl.controllers.rollout import Rollout, rollout
-from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.optimum import improve, improve_plan, simulate_plan, smooth_plan
 from cirl_marl.optimum.aims import aims_of, budget_texts
-from cirl_marl.optimum.linearised import jacobians, step_program
 
 
 def yearly(horizon: int = 6) -> Network:
@@ -155,13 +153,7 @@ def test_a_step_of_a_plan_knows_what_each_year_books() -> None:
     stores = [replace(node, holding={"emissions": 0.05}) if node.stores else node for node in network.nodes]
     network = replace(network, nodes=tuple(stores), accounts=tuple(replace(a, discount=0.3) for a in ACCOUNTS))
     solved = bound(network, min_service=0.5, at_most={"emissions/year": 3000.0, "emissions": 9000.0})
-    rng, dynamics = np.random.default_rng(0), Dynamics(network)
-    middle = replace(solved, actions=rng.uniform(-0.5, 0.5, solved.actions.shape))
-    run = simulate_plan(middle)
-    program = step_program(middle, dynamics, run, np.array([0.5]), np.ones(6), 0.1, jacobians(middle, dynamics))
-    moves = np.zeros(len(program.origin))
-    moves[program.action] = 1e-4 * rng.uniform(-1, 1, program.action.shape)
-    trial = simulate_plan(replace(middle, actions=middle.actions + moves[program.action]))
+    _, program, moves, run, trial = small_step(solved, 0.5)
     changes = np.append(by_year(trial) - by_year(run), trial.accounts[0, 1] - run.accounts[0, 1])
     np.testing.assert_allclose(program.problem.under[-5:] @ moves, changes, rtol=1e-3)
     np.testing.assert_allclose(program.problem.under_to[-5:-1], 3000.0 - by_year(run))
