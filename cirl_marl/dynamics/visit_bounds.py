@@ -29,7 +29,7 @@ class _Alike:
     """Splits of as many controlled arcs and as many others, whose choices are made together."""
 
     donors: Annotated[Integers, "the nodes, shape (splits,)"]
-    ends: Annotated[Integers, "what the arcs enter, the controlled ones first, negative at stocks, (splits, arcs)"]
+    ends: Annotated[Integers, "what the arcs enter, the controlled ones first, -1 at stocks, (splits, arcs)"]
     low: Annotated[Floats, "least shares of the controlled arcs, shape (splits, controlled, horizon)"]
     high: Annotated[Floats, "and the greatest"]
     proportions: Annotated[Floats, "of the other arcs in what is left, shape (splits, others, horizon)"]
@@ -40,22 +40,39 @@ class _Alike:
         nodes, alike, ends = zip(*members, strict=True)
         bounds = np.stack([split.bounds for split in alike])
         proportions = np.stack([split.proportions for split in alike])
-        return cls(np.array(nodes, dtype=np.intp), np.stack(ends), bounds[:, 0], bounds[:, 2], proportions)
+        return cls(
+            np.array(nodes, dtype=np.intp), np.maximum(np.stack(ends), -1), bounds[:, 0], bounds[:, 2], proportions
+        )
 
     def end_values(self, values: Floats) -> Floats:
-        """Return the values at the ends of the arcs, 0 at stocks, shape (splits, arcs, n)."""
-        return np.where(self.ends[..., None] >= 0, values[np.maximum(self.ends, 0)], 0.0)
+        """Return the values at the ends of the arcs, (splits, arcs, n); those of stocks are the last of ``values``."""
+        return values[self.ends]
 
     def best_shares(self, values: Floats, step: int) -> Floats:
-        """Return the shares that are best for ``values`` in one interval, shape (splits, arcs, n)."""
+        """Return the shares that are best for ``values`` in one interval, shape (splits, arcs, n), or n = 1 for all."""
+        count = self.low.shape[1] + 1
+        if count > 2:
+            return self._shares(np.argsort(-self._choices(values, step), axis=1, kind="stable"), step)
+        # one or two choices have an order or two, whatever the values
+        order = np.arange(count)[None, :, None]
+        shares = self._shares(order, step)
+        if count == 2:
+            choices = self._choices(values, step)
+            shares = np.where(choices[:, :1] >= choices[:, 1:], shares, self._shares(order[:, ::-1], step))
+        return shares
+
+    def _choices(self, values: Floats, step: int) -> Floats:
+        """Return the gains of controlled arcs, and the mean one of the others, which are one choice without bounds."""
+        chosen, rest_gains = np.split(self.end_values(values), [self.low.shape[1]], axis=1)
+        rest = (rest_gains * self.proportions[:, :, step, None]).sum(axis=1, keepdims=True)
+        return np.concatenate([chosen, rest], axis=1)
+
+    def _shares(self, order: Integers, step: int) -> Floats:
+        """Return the shares if choices get all the room that they have one after the other: a fractional knapsack."""
         low, high, proportions = (table[:, :, step, None] for table in (self.low, self.high, self.proportions))
-        gains, rest_gains = np.split(self.end_values(values), [low.shape[1]], axis=1)
-        # what is left to the arcs without control counts as one choice without bounds, of their mean value
-        gains = np.concatenate([gains, (rest_gains * proportions).sum(axis=1, keepdims=True)], axis=1)
-        room = np.ones_like(gains)
+        order = np.broadcast_to(order, (len(low), *order.shape[1:]))
+        room = np.ones(order.shape)
         room[:, :-1] = high - low
-        # a fractional knapsack: the best arcs get all the room that they have, one after the other
-        order = np.argsort(-gains, axis=1, kind="stable")
         sorted_room = np.take_along_axis(room, order, axis=1)
         before = np.cumsum(sorted_room, axis=1) - sorted_room
         allotment = np.empty_like(room)
@@ -89,9 +106,10 @@ class VisitBounds:
 
     def best(self, values: Floats, step: int) -> Floats:
         """Return max_s Σ_j s_ij V_j of each node i in one interval, V being 0 at stocks; shapes (nodes, n)."""
-        best_values = np.empty_like(values)
+        best_values, values = np.empty_like(values), _with_stocks(values)
         for group in self._splits:
-            best_values[group.donors] = (group.best_shares(values, step) * group.end_values(values)).sum(axis=1)
+            shares = group.best_shares(values, step)
+            best_values[group.donors] = (shares * group.end_values(values)).sum(axis=1)
         return best_values
 
     def total(self, step: int) -> Floats:
@@ -129,5 +147,10 @@ class VisitBounds:
     def _entries(self, values: Floats, step: int) -> Iterator[tuple[Integers, Integers, Floats]]:
         yield np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp), np.empty(0)
         for group in self._splits:
-            shares = group.best_shares(values[:, None], step)
+            shares = group.best_shares(_with_stocks(values[:, None]), step)
             yield np.repeat(group.donors, group.ends.shape[1]), group.ends.ravel(), shares.ravel()
+
+
+def _with_stocks(values: Floats) -> Floats:
+    """Return the values of nodes and, in a last row, those of stocks, which are 0."""
+    return np.append(values, np.zeros((1, values.shape[1])), axis=0)
