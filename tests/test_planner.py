@@ -24,6 +24,8 @@ from cirl_marl.optimum import NoCertificate, Plan, bound, improve, improve_plan,
 from cirl_marl.optimum.linearised import StepProgram, jacobians, step_program
 from cirl_marl.optimum.mpc import MPC
 from cirl_marl.optimum.planned_episodes import starting_states
+from cirl_marl.optimum.window_planner import WindowPlanner
+from cirl_marl.optimum.windows import WindowPlan
 
 KILOTONNES = {"kg": 1e6, "kt": 1.0, "Gt": 1e-6}
 
@@ -253,6 +255,51 @@ def test_mpc_goes_on_where_a_plan_is_missing(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(MPC, "_solve_window", solve)
     rollout(env, controller, seed=1)
     assert not controller.note
+
+
+def test_a_round_without_plan_leaves_the_best_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a round teaches may leave the next one without any plan; the best of those before is carried out."""
+    env, controller = MultiAgentVectorEnv("copper_net", num_envs=1, horizon=12), MPC(min_service=0.9)
+    plan, trial, best, rounds = WindowPlanner.plan, WindowPlanner._trial, list[WindowPlan](), [0]
+
+    def begun(self: WindowPlanner, *arguments: Any) -> WindowPlan:
+        rounds[0] = 0
+        best.append(plan(self, *arguments))
+        return best[-1]
+
+    def hindered(self: WindowPlanner, *arguments: Any, **options: Any) -> WindowPlan:
+        rounds[0] += 1
+        if rounds[0] > 1:
+            raise (solver.Infeasible if len(best) % 2 else solver.SolverFailure)("here")
+        return trial(self, *arguments, **options)
+
+    monkeypatch.setattr(WindowPlanner, "plan", begun)
+    monkeypatch.setattr(WindowPlanner, "_trial", hindered)
+    run = rollout(env, controller, seed=1)
+    assert not controller.note and len(best) == 3 and rounds[0] > 1
+    actions = np.concatenate([plan.actions[:4] for plan in best])
+    replayed = rollout(env, Plan(replace(bound(env.network, run.start, min_service=0.9), actions=actions)), seed=1)
+    np.testing.assert_allclose(replayed.flow, run.flow, rtol=1e-9)
+
+
+def test_without_windows_the_plan_of_the_episode_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where no window is solved, MPC goes on as the plan of the episode says, which it has for its prices."""
+    env = MultiAgentVectorEnv("copper_net", num_envs=1, horizon=12)
+    solve = MPC._solve_task
+
+    def hindered(self: MPC, *arguments: Any, is_outlook: bool = False) -> WindowPlan:
+        if not is_outlook:
+            raise solver.SolverFailure("here")
+        return solve(self, *arguments, is_outlook=is_outlook)
+
+    monkeypatch.setattr(MPC, "_solve_task", hindered)
+    controller = MPC(min_service=0.9, horizon=5)
+    run = rollout(env, controller, seed=1)
+    outlook = controller._outlooks[0]
+    assert "here" in controller.note and outlook.task.intervals == range(12)
+    followed = replace(bound(env.network, run.start, min_service=0.9), actions=outlook.actions)
+    expected = rollout(env, Plan(followed), seed=1)
+    np.testing.assert_allclose(run.flow, expected.flow, rtol=1e-9)
 
 
 def test_scales_leave_the_programs_answer() -> None:

@@ -297,11 +297,12 @@ class MPC(Planner):
         return costs
 
     def _older(self, copy: int, step: int, last: WindowPlan | None) -> _Plan:
-        """Return the last plan, to be carried out for longer, or one to be neutral where it has come to its end."""
+        """Return the last plan or that of the episode, to be carried out for longer; neutral actions without either."""
         episode = int(self._env.episodes[copy])
-        if last is not None and step in last.task.intervals:
-            first = step - last.task.intervals.start
-            return _Plan(episode, step, last.actions[first : first + self._replan], last)
+        for plan in (last, self._outlooks.get(copy, self._common_outlook)):
+            if plan is not None and step in plan.task.intervals:
+                first = step - plan.task.intervals.start
+                return _Plan(episode, step, plan.actions[first : first + self._replan], plan)
         neutral = np.concatenate([action[copy] for action in self._env.neutral_action.values()])
         return _Plan(episode, step, np.tile(neutral, (self._replan, 1)), None)
 

@@ -160,9 +160,9 @@ class Future:
         if correction is not None:
             rows, error = ProgramRows(layout, steps), correction.error
             rate, valve = correction.rate, correction.valve
-            if task.is_redrawn:  # they are of another future
-                rate = np.clip(rate, *admissible.rate[:, period])
-                valve = np.clip(valve, *admissible.valve[:, period])
+            # those of other intervals, or of another future, may be out of range
+            rate = np.clip(rate, *admissible.rate[:, period])
+            valve = np.clip(valve, *admissible.valve[:, period])
             held_controls(admissible.driver, self._hold, rate, valve, rows)
             low, under_to, rows_of_levels = problem.low.copy(), problem.under_to.copy(), level_rows(problem)
             under_to[rows_of_levels] -= (admissible.service_low[period] * error).ravel()
@@ -345,7 +345,10 @@ class WindowPlanner:
                     break
             if done < MOST_ROUNDS:
                 task = replace(trial.task, corrections=trial.corrections)
-                trial = self._trial(task, trial.basis(task.intervals))
+                try:
+                    trial = self._trial(task, trial.basis(task.intervals))
+                except (Infeasible, SolverFailure):  # what was learnt leaves no further plan
+                    break
         return best
 
     def _first_trial(self, task: WindowTask, basis: Basis | None) -> WindowPlan:
