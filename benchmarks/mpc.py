@@ -66,6 +66,8 @@ def outcomes(name: str) -> Iterator[Outcome]:
         controller = MPC(horizon=window, min_service=demanded)
         run = rollout(env, controller, seed=begun.seed, start=begun.initial_state)
         seconds = time.process_time() - start
+        if controller.note:
+            typer.echo(f"{name}, {_span(window)}: {controller.note}", err=True)
         # a level that is only just within reach is beyond the solver's tolerance
         levels = np.clip(run.episode_levels[0] - 1e-6, 0.0, 1.0)
         if proof is None:  # of the world at full service, where HiPO needs a minute

@@ -222,6 +222,11 @@ def test_a_middling_program_leaves_its_basis_and_takes_a_plan_whose_multipliers_
     tried.clear()
     solver.solve(problem, basis, certify=False)
     assert tried == [(solver.SETTINGS[1], None)]
+    tried.clear()  # what interior points do not solve is given up
+    monkeypatch.setattr(solver._ScaledProgram, "is_feasible", lambda *_: False)
+    with pytest.raises(solver.SolverFailure):
+        solver.solve(problem, basis, certify=False)
+    assert tried == [(solver.SETTINGS[1], None)]
 
 
 def test_without_hipo_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -25,7 +25,7 @@ from cirl_marl.optimum.linearised import StepProgram, jacobians, step_program
 from cirl_marl.optimum.mpc import MPC
 from cirl_marl.optimum.planned_episodes import starting_states
 from cirl_marl.optimum.window_planner import WindowPlanner
-from cirl_marl.optimum.windows import WindowPlan
+from cirl_marl.optimum.windows import WindowPlan, WindowTask
 
 KILOTONNES = {"kg": 1e6, "kt": 1.0, "Gt": 1e-6}
 
@@ -257,26 +257,26 @@ def test_mpc_goes_on_where_a_plan_is_missing(monkeypatch: pytest.MonkeyPatch) ->
     assert not controller.note
 
 
-def test_a_round_without_plan_leaves_the_best_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a round teaches may leave the next one without any plan; the best of those before is carried out."""
+def test_what_was_learnt_may_leave_no_plan(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A window then begins anew, and what is carried out is the best plan that there was before a round without one."""
     env, controller = MultiAgentVectorEnv("copper_net", num_envs=1, horizon=12), MPC(min_service=0.9)
-    plan, trial, best, rounds = WindowPlanner.plan, WindowPlanner._trial, list[WindowPlan](), [0]
+    plan, trial, best, failed = WindowPlanner.plan, WindowPlanner._trial, list[WindowPlan](), 0
 
-    def begun(self: WindowPlanner, *arguments: Any) -> WindowPlan:
-        rounds[0] = 0
+    def observed(self: WindowPlanner, *arguments: Any) -> WindowPlan:
         best.append(plan(self, *arguments))
         return best[-1]
 
-    def hindered(self: WindowPlanner, *arguments: Any, **options: Any) -> WindowPlan:
-        rounds[0] += 1
-        if rounds[0] > 1:
-            raise (solver.Infeasible if len(best) % 2 else solver.SolverFailure)("here")
-        return trial(self, *arguments, **options)
+    def hindered(self: WindowPlanner, task: WindowTask, *arguments: Any, **options: Any) -> WindowPlan:
+        nonlocal failed
+        if task.corrections is not None:
+            failed += 1
+            raise (solver.Infeasible if failed % 2 else solver.SolverFailure)("here")
+        return trial(self, task, *arguments, **options)
 
-    monkeypatch.setattr(WindowPlanner, "plan", begun)
+    monkeypatch.setattr(WindowPlanner, "plan", observed)
     monkeypatch.setattr(WindowPlanner, "_trial", hindered)
     run = rollout(env, controller, seed=1)
-    assert not controller.note and len(best) == 3 and rounds[0] > 1
+    assert not controller.note and len(best) == 3 and failed == 5  # in the first window nothing was learnt before
     actions = np.concatenate([plan.actions[:4] for plan in best])
     replayed = rollout(env, Plan(replace(bound(env.network, run.start, min_service=0.9), actions=actions)), seed=1)
     np.testing.assert_allclose(replayed.flow, run.flow, rtol=1e-9)
