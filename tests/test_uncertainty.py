@@ -193,7 +193,10 @@ def test_files_state_it(tmp_path: Path) -> None:
     [
         ("range = [1.5, 0.5]", r"arcs.dross.share.range: \[1.5, 0.5\] must have its lower end first, 1"),
         ("range = [1.2, 1.5]", r"range: \[1.2, 1.5\] must contain the number, 1"),
-        ("deviation = -1", r"arcs.dross.share: deviation -1: what spreads, and its deviation, must be positive"),
+        (
+            "deviation = -1",
+            r"arcs.dross.share: deviation -1: what spreads must not be 0, and its deviation must be positive",
+        ),
         ('distribution = "normal"', r"arcs.dross.share.distribution: 'normal' needs a deviation or a range"),
         ('range = [0.5, 1.5], distribution = "norml"', r"Did you mean 'normal'"),
         ('range = [0.5, 1.5], distribution = "normal"', r"distribution 'normal' needs a deviation"),

@@ -312,12 +312,13 @@ class Converter:
             return
         middle = float(np.mean(value.values)) if isinstance(value, Series) else float(value)
         if deviation is not None and relative is None:
-            relative = deviation * unit / middle if middle > 0 else 0.0
-        if middle <= 0 or (relative is not None and relative <= 0):
-            fault = f"deviation {deviation}" if middle > 0 else f"the number is {middle / unit:g}"
-            self.mistakes.append(f"{path}: {fault}: what spreads, and its deviation, must be positive")
+            relative = deviation * unit / abs(middle) if middle else 0.0
+        if middle == 0 or (relative is not None and relative <= 0):
+            fault = f"deviation {deviation}" if middle else "the number is 0"
+            self.mistakes.append(f"{path}: {fault}: what spreads must not be 0, and its deviation must be positive")
             return
-        low, high = (0.0, math.inf) if span is None else (float(end * unit / middle) for end in span)
+        first, last = (0.0, math.inf) if span is None else (float(end * unit / middle) for end in span)
+        low, high = (last, first) if middle < 0 and span is not None else (first, last)  # a revenue is a negative rate
         if low >= high or not low <= 1 <= high:
             demand = "contain the number" if low < high else "have its lower end first"
             self.mistakes.append(f"{path}.range: {list(span or ())} must {demand}, {middle / unit:g}")

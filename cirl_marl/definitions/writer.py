@@ -229,7 +229,7 @@ def _spread_keys(spread: Spread | None, value: Value) -> dict[str, Any]:
         # in percent, so that it reads back to the last bit
         entries["deviation"] = f"{Decimal(repr(float(spread.deviation))) * 100:f} %"
     if math.isfinite(spread.high):
-        entries["range"] = [spread.low * middle, spread.high * middle]
+        entries["range"] = sorted([spread.low * middle, spread.high * middle])
     return entries
 
 
