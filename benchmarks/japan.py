@@ -14,6 +14,7 @@ import numpy as np
 
 from benchmarks.document import write_sections
 from benchmarks.japan_copper import copper, world
+from benchmarks.japan_costs import abatement, front
 from benchmarks.japan_decisions import decisions, levers_of
 from benchmarks.steel import PRIMARY, TABLE, calibrated, countries, populations, possible_network
 from cirl_marl import Levers, MultiAgentVectorEnv, levers, load_network
@@ -34,7 +35,9 @@ POSSIBLE = 16
 """Histories and lifetimes that the data allow, for which levers are pulled."""
 TOGETHER = {"what is exported, steel or goods": ("semis_exports", "long_exports", "flat_exports", "goods_exports")}
 """Agents of one decision: what Japan exports, whatever its form."""
-SECTIONS = ("saved", "levers", "ranges", "trade", "lives", "spread", "copper", "copper_world", "later")
+SECTIONS = (
+    *("saved", "levers", "costs", "abatement", "ranges", "trade", "lives", "spread", "copper", "copper_world", "later"),
+)
 """Parts of the document that are measured."""
 ORE = {"ore": ("mining", "ore_imports")}
 """What makes up for what is lacking in the world without shocks, and is a decision where demand is not known."""
@@ -173,6 +176,8 @@ def main() -> None:
         save_levers(DOCUMENT.parent / "pictures" / "japan_levers.png", result)
         parts = {"saved": question(result), "levers": order(result)}
     parts |= {
+        "costs": front(NAME),
+        "abatement": abatement(NAME),
         "ranges": ranges(),
         "trade": trade(),
         "lives": lives(),

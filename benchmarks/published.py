@@ -1,4 +1,4 @@
-"""Cycles of the world against what is published of single years: a table of docs/data.md.
+"""Cycles of the world against what is published of single years: tables of docs/data.md and docs/accounts.md.
 
 python -m benchmarks.published
 """
@@ -8,13 +8,18 @@ from __future__ import annotations
 import fnmatch
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
-from benchmarks.document import write_sections
+from benchmarks.document import markdown_table, write_sections
 from benchmarks.steel import DOCUMENT
-from cirl_marl import CirlError, simulate
+from cirl_marl import CirlError, MultiAgentVectorEnv, simulate
+from cirl_marl.controllers import Neutral
+from cirl_marl.controllers.rollout import rollout
 from cirl_marl.errors import unknown_name
 from cirl_marl.evaluation.simulations import Simulation
+
+ACCOUNTS = Path(__file__).parent.parent / "docs" / "accounts.md"
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +78,48 @@ FIGURES = (
 )
 
 
+@dataclass(frozen=True, slots=True)
+class Amount:
+    """What is published of an account."""
+
+    network: str
+    account: str
+    unit: Annotated[str, "of the amount, or of thousands of it for a unit of mass that flows"]
+    value: float
+    source: str
+    arcs: Annotated[tuple[str, ...], "flows for whose sum it is; () for the amount of a year"] = ()
+
+
+CAST = ("*bof_steel", "*eaf_steel")
+AMOUNTS = (
+    Amount("steel_world", "emissions", "t CO2e/t cast", 1.91, "worldsteel, 2022, a tonne of steel", CAST),
+    Amount("steel_world", "energy", "GJ/t cast", 20.99, "worldsteel, 2022, likewise", CAST),
+    Amount("aluminium_world", "emissions", "Mt CO2e", 1110.0, "IAI, with rolling"),
+    Amount("aluminium_world", "energy", "PJ", 4356.0, "IAI: smelters 2021, refineries 2024"),
+    Amount("copper_world", "emissions", "Mt CO2e", 97.0, "ICA, refined copper, 2018"),
+    Amount("plastics_world", "emissions", "Mt CO2e", 1798.0, "OECD 2022, of 2019"),
+)
+
+
+def first_year(amount: Amount) -> float:
+    """Return what the model has of an account in its first year, as it is published."""
+    env = MultiAgentVectorEnv(amount.network, num_envs=1, horizon=1)
+    run, accounts = rollout(env, Neutral()), [account.id for account in env.network.accounts]
+    total = float(run.bookings[0, accounts.index(amount.account), 0])
+    names = [arc.id for arc in env.network.arcs]
+    chosen = {name for pattern in amount.arcs for name in fnmatch.filter(names, pattern)}
+    return 1e3 * total / float(run.flow[0, [name in chosen for name in names]].sum()) if chosen else total
+
+
+def amounts() -> Iterator[tuple[str, ...]]:
+    """Yield the rows of the table of accounts."""
+    for amount in AMOUNTS:
+        here = first_year(amount)
+        digits = 2 if amount.arcs else 0
+        numbers = (f"{here:.{digits}f} {amount.unit}", f"{amount.value:.{digits}f}", f"{here / amount.value - 1:+.0%}")
+        yield f"`{amount.network}`", amount.account, *numbers, amount.source
+
+
 def modelled(figure: Figure, simulation: Simulation, year: int) -> float:
     """Return the model's value of a year, Mt/a.
 
@@ -104,3 +151,5 @@ def lines() -> Iterator[str]:
 
 if __name__ == "__main__":
     write_sections(DOCUMENT, {"published": "\n".join(lines())})
+    header = ("network", "account", "first year", "published", "off", "source")
+    write_sections(ACCOUNTS, {"amounts": markdown_table(header, amounts())})

@@ -171,7 +171,9 @@ def test_what_no_file_holds_is_refused_before_anything_is_simulated(
     (tmp_path / "file").touch()
     iamc, japan, twice = str(tmp_path / "iamc.csv"), ["steel_japan"], tmp_path / "twice.toml"
     network = load_network("steel_japan")
-    write_network(replace(network, accounts=(replace(network.accounts[0], title="Circularity"),)), twice)
+    write_network(
+        replace(network, accounts=(replace(network.accounts[0], title="Circularity"), *network.accounts[1:])), twice
+    )
     for arguments, message in (
         ([*japan, "--iamc", "iamc.xlsx"], "--iamc iamc.xlsx: needs the name of a .csv file"),
         ([*japan, "--iamc", str(tmp_path / "file" / "iamc.csv")], "file is a file, not a folder"),
