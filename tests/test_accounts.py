@@ -494,7 +494,7 @@ def test_ranges_of_factors_leave_all_other_draws_alone() -> None:
     assert default.uncertain == {path: s for path, s in scenario.uncertain.items() if ".accounts." not in path}
     factors = {path.split(".", 1)[1] for path in scenario.uncertain if ".accounts." in path}
     assert factors == {
-        "scrap_exports.accounts.cost",
+        *("scrap_exports.accounts.cost", "bof_steel.accounts.cost"),
         *(f"{arc}.accounts.{account}" for arc in ("pig_iron_made", "eaf_steel") for account in ("cost", "energy")),
     }
     assert (default.arcs, default.nodes, default.accounts) == (scenario.arcs, scenario.nodes, scenario.accounts)
