@@ -117,6 +117,7 @@ def step_program(
     slopes: tuple[Floats, Floats, Floats],
     margin: Floats | float = 0.0,
     limits: Floats | None = None,
+    is_leap: bool = False,
 ) -> StepProgram:
     """Return the program of the best change of the actions within a trust region, to first order.
 
@@ -134,6 +135,8 @@ def step_program(
         margin: by how much more of a service than its band begins with counts as all of it, relative to that, shape
             (services, steps).
         limits: budgets of accounts, shape (budgets,); None: those of the bound.
+        is_leap: whether what products of contents would be at the levels demanded counts, not at those of the episode:
+            what is too impure then gets better as less is made, as it will once nothing is.
     """
     network, limits = bound.network, bound.aims.limits if limits is None else limits
     steps, entries = bound.actions.shape
@@ -163,6 +166,7 @@ def step_program(
         own[np.arange(services), level + np.arange(services)] = low[:, t]
         for s, part, whole, least, most in contents:
             share, mass, total = run.levels[0, s, t], float(part @ state[t]), float(whole @ state[t])
+            share = max(share, demand[s]) if is_leap else share
             if math.isfinite(most[t]) and mass >= least[t] * total:
                 # level·part ≤ most·whole, to first order: part·level + level₀·δpart − most·δwhole ≤ most·whole
                 table[s] = (share * part - most[t] * whole) @ response
