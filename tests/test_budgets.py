@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,9 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from small_networks import city, with_lambda
+from small_networks import city
 from test_capacities import power
-from typer.testing import CliRunner
 
 from cirl_marl import (
     MPC,
@@ -21,14 +19,10 @@ from cirl_marl import (
     MultiAgentVectorEnv,
     Network,
     Trained,
-    account_front,
-    load_network,
     load_recipe,
     parallel_env,
     train,
-    write_network,
 )
-from cirl_marl.cli import app
 from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.network.disturbances import AutoRegression, DisturbanceEffect
@@ -285,35 +279,6 @@ def test_mpc_in_a_disturbed_network_charges_for_budgets() -> None:
             booked_emissions[budget is None] = float(run.accounts[:, 1].mean())
             assert run.episode_levels.mean() > 0.95 - 0.01
         assert booked_emissions[False] < 0.85 * booked_emissions[True]
-
-
-@pytest.mark.slow
-def test_the_front_of_two_aims_is_proved_and_reached(tmp_path: Path) -> None:
-    """Plans lie on the worse side of the front and near it; prices are its slope; both have a hypervolume."""
-    file = tmp_path / "city.toml"
-    write_network(city(), file)
-    for axes in (("circularity", "emissions"), ("cost", "emissions")):
-        front = account_front(file, axes, min_service=0.9, points=4)
-        at_plans = front.at(front.plans[:, 1])
-        assert (front.sign * (at_plans - front.plans[:, 0]) >= -1e-5 * abs(at_plans)).all()
-        np.testing.assert_allclose(front.at(front.budgets), front.bounds, rtol=1e-4)
-        assert (np.diff(front.prices) <= 1e-6 * front.prices[0]).all() and front.prices[0] > 0
-        assert (front.plans[:, 1] <= front.budgets * (1 + 1e-4)).all() and (front.levels <= 1).all()
-        proved, achieved = front.volumes
-        assert 0.99 * proved <= achieved <= proved * (1 + 1e-5)
-        assert replace(front, shortages=np.ones(4)).volumes == (proved, 0.0)
-    out = ["--min-service", "0.9", "--points", "3", "--out", str(tmp_path / "front")]
-    result = CliRunner().invoke(app, ["pareto", str(file), "--between", "cost,emissions", *out])
-    assert result.exit_code == 0, result.output
-    with (tmp_path / "front" / "pareto.csv").open(encoding="utf-8") as lines:
-        assert len(list(csv.reader(lines))) == 4
-    assert (tmp_path / "front" / "pareto.png").stat().st_size > 1000
-    with pytest.raises(CirlError, match="then another account"):
-        account_front(file, ("cost", "circularity"), min_service=0.9)
-    with pytest.raises(CirlError, match="nothing to weigh"):
-        account_front(with_lambda(load_network("paper_city")), ("circularity", "moved"), min_service=0.9)
-    with pytest.raises(CirlError, match="nothing to weigh"):  # less ore is less of both
-        account_front("copper_world", ("circularity", "emissions"), min_service=1.0)
 
 
 def test_multipliers_of_a_budget_hold_at_other_starts() -> None:

@@ -118,7 +118,10 @@ def pareto(
     recipe: Annotated[
         str | None, typer.Option(help="Learner recipe to train with several weights; default: bound and plans only.")
     ] = None,
-    points: Annotated[int, typer.Option(min=2, help="Service levels of the bound, and weights of the learners.")] = 5,
+    points: Annotated[
+        int | None,
+        typer.Option(min=2, help="Service levels of the bound, and weights of the learners, or demands on each aim."),
+    ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Training seeds of each weight: 0, 1, …")] = 1,
     steps: Annotated[
         int | None, typer.Option(min=1, help="Environment steps of each training; default: the recipe's.")
@@ -133,7 +136,7 @@ def pareto(
     ] = None,
     between: Annotated[
         str | None,
-        typer.Option(help="AIM,ACCOUNT: circularity or an account, against an account, at --min-service."),
+        typer.Option(help="AIM,AIM[,AIM]: circularity or an account, against one or two accounts or services."),
     ] = None,
     min_service: common.MinService = None,
     html: common.Html = None,
@@ -143,7 +146,8 @@ def pareto(
     The bound is swept over the service demanded, the learners over the weight of circularity in their reward, 0 to 1.
     Finished trainings are kept: the same command goes on where it was stopped.
 
-    With --between circularity or an account is held against budgets of another account, such as cost against emissions.
+    With --between two or three aims are held against each other, such as cost against emissions, or circularity against
+    emissions and a service; --min-service is demanded of services that are no aim.
     """
     from cirl_marl.definitions.catalogue import load_network
     from cirl_marl.evaluation.pareto import pareto_front as swept
@@ -159,7 +163,7 @@ def pareto(
         return
     if min_service is not None:
         raise CirlError("--min-service goes with --between; without it service is one of the aims")
-    options: dict[str, Any] = {"points": points, "seeds": seeds, "steps": steps, "episodes": episodes}
+    options: dict[str, Any] = {"points": points or 5, "seeds": seeds, "steps": steps, "episodes": episodes}
     try:
         with common.shares() as progress:
             place: dict[str, Any] = {"directory": folder, "on": on, "workers": workers}
@@ -180,18 +184,15 @@ def pareto(
 
 
 def _between(
-    network: str, scenario: str | None, axes: str, min_service: float | None, points: int, folder: Path
+    network: str, scenario: str | None, axes: str, min_service: float | None, points: int | None, folder: Path
 ) -> None:
-    """Hold an aim against budgets of an account."""
+    """Hold an aim against demands on one or two others."""
     from cirl_marl.evaluation.account_front import account_front
     from cirl_marl.report.account_tables import front_table, write_account_front
 
-    names = [name.strip() for name in axes.split(",")]
-    if len(names) != 2 or min_service is None:
-        raise CirlError(f"--between {axes}: needs AIM,ACCOUNT and --min-service, which both are weighed at")
     options: dict[str, Any] = {"scenario": scenario, "points": points, "min_service": min_service}
     with common.shares() as progress:
-        front = account_front(network, (names[0], names[1]), progress=progress, **options)
+        front = account_front(network, common.comma_separated(axes), progress=progress, **options)
     common.console.print(front_table(front))
     proved, achieved = front.volumes
     if proved > 0:

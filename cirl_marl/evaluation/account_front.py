@@ -1,13 +1,16 @@
-"""Two aims against each other, λ̄ or totals of accounts: what is possible at most, and what plans achieve.
+"""Two or three aims against each other, λ̄, services, totals of accounts: what is possible, and what plans achieve.
 
-The second is bounded by budgets from what the plan with least of it takes to what the best of the first takes. Each
-program proves a line that no episode exceeds, v + p·(b − b_k), v its optimum at the budget b_k and p the price of that;
-the least of all lines is the front. Between money and emissions p is the price of carbon, and the front the curve of
-marginal costs.
+The first is the best that there is at several demands on the others: budgets of accounts, from what the plan with least
+of it takes to what the best of the first takes, and levels of services, from those of the best of the first to the
+highest. Each program proves a plane that no episode exceeds, v + Σ_i p_i·(b_i − b_ki), v its optimum at the demands b_k
+and p_i the price of each; the least of all planes is the front. Between money and emissions p is the price of carbon,
+and the front the curve of marginal costs.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -18,139 +21,245 @@ from cirl_marl.controllers.basic import Neutral
 from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, whole_number
-from cirl_marl.evaluation.comparison import ProgressReport, part_of
+from cirl_marl.errors import CirlError, unknown_name, whole_number
+from cirl_marl.evaluation.comparison import ProgressReport
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import CIRCULARITY
-from cirl_marl.optimum import bound, improve_plan, simulate_plan
+from cirl_marl.optimum import Bound, bound, improve_plan, simulate_plan
 from cirl_marl.optimum.aims import aims_of
+from cirl_marl.optimum.bounds import highest_level
 from cirl_marl.optimum.improve import shortage
+from cirl_marl.optimum.options import demanded_levels
+from cirl_marl.optimum.supply_limits import with_supply_limits
 
 TIGHTEST = 1e-4
-"""Range of budgets, relative to the highest, below which there is nothing to weigh."""
+"""Range of a demand, relative to the highest, below which there is nothing to weigh."""
 SERVED = 1e-3
 """What a plan may lack of a service, or exceed its budget by relative to that, and count."""
+POINTS = {2: 7, 3: 4}
+"""How many demands there are on each other aim, by the number of aims."""
+WITHIN_REACH = 1e-6
+"""By how much the highest level demanded of a service is less than the highest there is, which no solver holds."""
 
 
 @positional_record
 class AccountFront:
-    """λ̄, or the total of an account, at each of several budgets of another account; k budgets."""
+    """λ̄, or the total of an account, at k demands on one or two other aims; d aims in all."""
 
     network: Network
-    axes: Annotated[tuple[str, str], "what is aimed at, and what has budgets"]
-    min_service: Annotated[Floats, "mean level demanded of each service, shape (services,)"]
-    budgets: Annotated[Floats, "shape (k,), rising"]
+    axes: Annotated[tuple[str, ...], "what is aimed at, and what has demands"]
+    min_service: Annotated[Floats, "mean level demanded of each service that is no aim, shape (services,)"]
+    demands: Annotated[Floats, "budgets, and least levels of services, shape (k, d − 1)"]
     bounds: Annotated[Floats, "best possible of the first, shape (k,)"]
-    prices: Annotated[Floats, "what the first gains by one more of the budget, shape (k,)"]
-    plans: Annotated[Floats, "what plans come to in the simulator, first and second, shape (k, 2)"]
+    prices: Annotated[Floats, "what the first gains by one more of a demand, loses by a level, shape (k, d − 1)"]
+    plans: Annotated[Floats, "what plans come to in the simulator, shape (k, d)"]
     levels: Annotated[Floats, "least mean level of a service under each plan, shape (k,)"]
     shortages: Annotated[Floats, "most that a plan is short of a service or exceeds its budget, relative, shape (k,)"]
-    as_usual: Annotated[Floats, "first and second under neutral control, shape (2,)"]
+    as_usual: Annotated[Floats, "the aims under neutral control, shape (d,)"]
 
     @property
-    def sign(self) -> float:
-        """1 if more of the first is better, −1 if less is."""
-        return 1.0 if self.axes[0] == CIRCULARITY else -1.0
+    def signs(self) -> Floats:
+        """1 where more is better, −1 where less is, shape (d,)."""
+        accounts = {account.id for account in self.network.accounts}
+        return np.array([-1.0 if axis in accounts else 1.0 for axis in self.axes])
 
     @property
-    def units(self) -> tuple[str, str]:
-        """Those of the two."""
-        units = {account.id: account.unit for account in self.network.accounts}
-        return tuple(units.get(axis, self.network.mass_unit) for axis in self.axes)  # type: ignore[return-value]
+    def units(self) -> tuple[str, ...]:
+        """Those of the aims."""
+        units = {account.id: account.unit for account in self.network.accounts} | {CIRCULARITY: self.network.mass_unit}
+        return tuple(units.get(axis, "1") for axis in self.axes)
 
-    def at(self, budgets: ArrayLike) -> Floats:
-        """Return what is proved of the first at other budgets."""
-        lines = self.sign * self.bounds[:, None] + self.prices[:, None] * (np.ravel(budgets) - self.budgets[:, None])
-        return self.sign * np.asarray(lines.min(axis=0))
+    def at(self, demands: ArrayLike) -> Floats:
+        """Return what is proved of the first, shape (n,), at other demands, shape (n, d − 1)."""
+        points = np.reshape(demands, (-1, len(self.axes) - 1))
+        lines = self.signs[0] * self.bounds + ((points[:, None] - self.demands) * self.prices).sum(axis=2)
+        return np.asarray(self.signs[0] * lines.min(axis=1))
 
     @property
     def volumes(self) -> tuple[float, float]:
-        """Areas that proved points and plans dominate within the nadir of the proved ones: the hypervolumes.
+        """What proved points and plans dominate within the nadir of the proved ones: the hypervolumes.
 
         Plans that are short of what is demanded do not count.
         """
-        nadir = self.budgets[-1], float(self.sign * self.bounds[0])
-        served_plans = self.plans[self.shortages <= SERVED]
-        points = (np.stack([self.budgets, self.sign * self.bounds]), served_plans.T[::-1] * [[1.0], [self.sign]])
-        bounds, plans = (area_dominated(second, first, *nadir) for second, first in points)
-        return bounds, plans
+        proved = self.signs * np.column_stack([self.bounds, self.demands])
+        plans = self.signs * self.plans[self.shortages <= SERVED]
+        nadir = proved.min(axis=0)
+        return volume_dominated(proved, nadir), volume_dominated(plans, nadir)
 
 
-def area_dominated(second: Floats, first: Floats, most: float, least: float) -> float:
-    """Return the area below and right of some points, up to ``most`` of the second and down to ``least`` of the first.
+def volume_dominated(points: Floats, nadir: Floats) -> float:
+    """Return the volume of all that is at most as good as one of some points, shape (k, d), and better than ``nadir``.
 
-    >>> area_dominated(np.array([1.0, 2.0]), np.array([1.0, 3.0]), 4.0, 0.0)
+    More is better. Volumes of fewer dimensions are added along the last one.
+
+    >>> volume_dominated(np.array([[1.0, 3.0], [3.0, 2.0]]), np.array([0.0, 0.0]))
     7.0
     """
-    order = np.argsort(second)
-    ends = np.append(np.minimum(second[order], most), most)
-    heights = np.maximum.accumulate(np.maximum(first[order] - least, 0.0))
-    return float(np.diff(ends) @ heights)
+    points = points[(points > nadir).all(axis=1)]
+    if not len(points):
+        return 0.0
+    points = points[np.argsort(-points[:, -1])]
+    if len(nadir) == 1:
+        return float(points[0, 0] - nadir[0])
+    heights = -np.diff(np.append(points[:, -1], nadir[-1]))
+    areas = [volume_dominated(points[: k + 1, :-1], nadir[:-1]) for k in range(len(points))]
+    return float(heights @ areas)
 
 
 def account_front(
     network: str | Path | Network,
-    axes: tuple[str, str],
+    axes: Sequence[str],
     *,
-    min_service: ArrayLike,
+    min_service: ArrayLike | None = None,
     scenario: str | None = None,
-    points: int = 7,
+    points: int | None = None,
     progress: ProgressReport = lambda activity, share: None,
 ) -> AccountFront:
-    """Hold two aims against each other at a demanded service: λ̄ or an account, and a further account.
+    """Hold two or three aims against each other at a demanded service: λ̄ or an account, and accounts or services.
 
     Args:
-        network: catalogue name, definition file, or network, with accounts.
-        axes: ``circularity`` or an account, and an account.
-        min_service: mean level of every service, or of each, shape (services,).
+        network: catalogue name, definition file, or network.
+        axes: ``circularity`` or an account, and one or two further accounts or services.
+        min_service: mean level of every service that is no aim, or of each, shape (services,); needed if there is one.
         scenario: of the definition; None is the default.
-        points: how many budgets, at least 3.
+        points: how many demands on each other aim, at least 3; None: POINTS.
         progress: as for ``compare``.
 
     Raises:
-        CirlError: for input that cannot be used, or if both can be had at once, so that there is nothing to weigh.
+        CirlError: for input that cannot be used, or if all can be had at once, so that there is nothing to weigh.
         NoCertificate: for a network whose flows are not linear laws.
     """
-    whole_number("points", points, 3)
     definition = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
-    first, second = axes
-    if first == second or second == CIRCULARITY:
-        raise CirlError(f"front of {first} and {second}: give '{CIRCULARITY}' or an account, then another account")
-    aims, bounded = aims_of(definition, first, None), aims_of(definition, second, None)
-    assert bounded.account is not None
-    progress("bounds and plans", 0.0)
-    free, least = (bound(definition, aim=aim, min_service=min_service) for aim in axes)
-    lowest = simulate_plan(improve_plan(least)).accounts[0, bounded.account]
-    highest = free.accounts[bounded.account]
-    if highest - lowest <= TIGHTEST * abs(highest):
+    _check_axes(definition, axes)
+    points = whole_number("points", POINTS[len(axes)] if points is None else points, 3)
+    others = [service.id for service in definition.services if service.id not in axes]
+    if min_service is None and others:
         raise CirlError(
-            f"network '{definition.name}': the best {first} takes no more {second} than the least that a plan does, "
-            f"{lowest:.6g} {definition.accounts[bounded.account].unit}, so that there is nothing to weigh"
+            f"front of {', '.join(axes)}: give min_service, at which they are weighed, of {', '.join(others)}"
         )
-    budgets = np.linspace(lowest, highest, points)
-    solutions, runs = [], []
-    for place, budget in enumerate(budgets.tolist()):
-        solutions.append(bound(definition, aim=first, at_most={second: budget}, min_service=min_service))
-        report = part_of(progress, "bounds and plans", place / points, 1 / points)
-        runs.append(simulate_plan(improve_plan(solutions[-1], progress=report)))
-    env = MultiAgentVectorEnv(definition, num_envs=1)
-    origin = episode_start(env)
-    as_usual = rollout(env, Neutral(), seed=origin.seed, start=origin.initial_state)
-    sign = 1.0 if aims.account is None else -1.0
+    levels = demanded_levels(definition, 0.0 if min_service is None else min_service).copy()
+    levels[[service.id in axes for service in definition.services]] = 0.0
+    sweep = _Sweep(definition, tuple(axes), points, levels, progress)
+    sweep.run(tuple(axes), {}, levels)
+    if len(sweep.solutions) == 1:
+        ends = " and ".join(f"{axis} {value:.6g}" for axis, value in zip(axes[1:], sweep.demands[0], strict=True))
+        raise CirlError(
+            f"network '{definition.name}': the best {axes[0]} takes no more than the best there is of {ends}, so "
+            "that there is nothing to weigh"
+        )
+    return sweep.front()
 
-    def coordinates(run: Rollout) -> list[float]:
-        return [sign * aims.value(run), -bounded.value(run)]
 
-    return AccountFront(
-        network=definition,
-        axes=axes,
-        min_service=np.zeros(0) if free.min_service is None else free.min_service,
-        budgets=budgets,
-        bounds=np.array([sign * each.objective for each in solutions]),
-        prices=np.array([each.budget_prices[second] for each in solutions]),
-        plans=np.array([coordinates(run) for run in runs]),
-        levels=np.array([float(run.least_service[0]) for run in runs]),
-        shortages=np.array([shortage(each, run) for each, run in zip(solutions, runs, strict=True)]),
-        as_usual=np.array(coordinates(as_usual)),
-    )
+def _check_axes(network: Network, axes: Sequence[str]) -> None:
+    accounts, services = ([part.id for part in parts] for parts in (network.accounts, network.services))
+    names = [CIRCULARITY, *accounts, *services]
+    for axis in axes:
+        if axis not in names:
+            raise CirlError(f"network '{network.name}': front: {unknown_name('aim', axis, names)}")
+    is_first = axes[:1] and axes[0] in (CIRCULARITY, *accounts)
+    if len(axes) not in (2, 3) or len(set(axes)) < len(axes) or not is_first or CIRCULARITY in axes[1:]:
+        choice = f"give '{CIRCULARITY}' or an account, then one or two other accounts or services"
+        raise CirlError(f"front of {', '.join(axes)}: {choice}")
+
+
+class _Sweep:
+    """Programs and plans at all demands.
+
+    Idle supplies have lower ends in programs, which no episode exceeds that is as good as where others are best.
+    """
+
+    def __init__(
+        self, network: Network, axes: tuple[str, ...], points: int, min_service: Floats, progress: ProgressReport
+    ) -> None:
+        """Find out how bad the first of ``axes`` is where each other one is best."""
+        self.definition, self.axes, self.points, self.min_service = network, axes, points, min_service
+        self.demands: list[list[float]] = []
+        self.solutions: list[Bound] = []
+        self.runs: list[Rollout] = []
+        self._progress, self._aims = progress, aims_of(network, axes[0], None)
+        self._accounts = [account.id for account in network.accounts]
+        self._services = [service.id for service in network.services]
+        progress("bounds and plans", 0.0)
+        self._programs = network
+        free = bound(network, aim=axes[0], min_service=min_service)
+        self._least = min(self._aims.value(self._plan_of_best(axis)) for axis in axes[1:])
+        self._programs = with_supply_limits(free, self._least)
+
+    def _plan_of_best(self, axis: str) -> Rollout:
+        """Return the episode of the plan that has most of a service, or least of an account."""
+        if axis in self._accounts:
+            return self._carried_out(bound(self._programs, aim=axis, min_service=self.min_service))
+        service = self._services.index(axis)
+        levels = self.min_service.copy()
+        levels[service] = highest_level(self._programs, service, levels) - WITHIN_REACH
+        return self._carried_out(bound(self._programs, aim=self.axes[0], min_service=levels))
+
+    def _carried_out(self, solution: Bound) -> Rollout:
+        """Return the episode of the network under the plan of a program."""
+        return simulate_plan(improve_plan(replace(solution, network=self.definition)))
+
+    def run(self, axes: tuple[str, ...], budgets: Mapping[str, float], levels: Floats) -> None:
+        """Solve the program at some demands, or those at several demands on the last of ``axes``."""
+        first, last = axes[0], axes[-1]
+        if len(axes) == 1:
+            solution = bound(self._programs, aim=first, at_most=budgets, min_service=levels)
+            if solution.objective < self._least:  # limits of supplies are none of episodes as bad as this
+                solution = bound(self.definition, aim=first, at_most=budgets, min_service=levels)
+            self.solutions.append(solution)
+            self.runs.append(self._carried_out(solution))
+            self.demands.append([budgets.get(axis, levels[self._place(axis)]) for axis in self.axes[1:]])
+            share = len(self.solutions) / self.points ** (len(self.axes) - 1)
+            self._progress("bounds and plans", share)
+            return
+        free = bound(self._programs, aim=first, at_most=budgets, min_service=levels)
+        if last in self._accounts:
+            place = self._accounts.index(last)
+            best = bound(self._programs, aim=last, at_most=budgets, min_service=levels)
+            ends = float(self._carried_out(best).accounts[0, place]), float(free.accounts[place])
+        else:
+            place = self._services.index(last)
+            most = highest_level(self._programs, place, levels, budgets) - WITHIN_REACH
+            ends = float(free.levels[place]), most
+        is_range = ends[1] - ends[0] > TIGHTEST * abs(ends[1])
+        for demand in np.linspace(*ends, self.points).tolist() if is_range else [max(ends)]:
+            more = levels.copy()
+            if last in self._services:
+                more[self._services.index(last)] = demand
+            self.run(axes[:-1], {**budgets, last: demand} if last in self._accounts else budgets, more)
+
+    def _place(self, axis: str) -> int:
+        """Return the position of a service; 0 of what is none."""
+        return self._services.index(axis) if axis in self._services else 0
+
+    def front(self) -> AccountFront:
+        """Return what was solved."""
+        env = MultiAgentVectorEnv(self.definition, num_envs=1)
+        origin = episode_start(env)
+        as_usual = rollout(env, Neutral(), seed=origin.seed, start=origin.initial_state)
+        sign = 1.0 if self._aims.account is None else -1.0
+        pairs = zip(self.solutions, self.runs, strict=True)
+        return AccountFront(
+            network=self.definition,
+            axes=self.axes,
+            min_service=self.min_service,
+            demands=np.array(self.demands),
+            bounds=sign * np.array([solution.objective for solution in self.solutions]),
+            prices=np.array([self._prices(solution) for solution in self.solutions]),
+            plans=np.array([self._coordinates(run) for run in self.runs]),
+            levels=np.array([float(run.least_service[0]) for run in self.runs]),
+            shortages=np.array([shortage(solution, run) for solution, run in pairs]),
+            as_usual=np.array(self._coordinates(as_usual)),
+        )
+
+    def _prices(self, solution: Bound) -> list[float]:
+        """Return what one more of each demand adds to the objective."""
+        levels = dict(zip(self._services, solution.certificate.under[-len(self._services) :].tolist(), strict=True))
+        return [(solution.budget_prices | levels)[axis] for axis in self.axes[1:]]
+
+    def _coordinates(self, run: Rollout) -> list[float]:
+        """Return what an episode has of each aim."""
+        of_services = zip(self._services, run.episode_levels[0].tolist(), strict=True)
+        of_accounts = zip(self._accounts, run.accounts[0].tolist(), strict=True)
+        values = {CIRCULARITY: float(run.episode_circularity[0]), **dict(of_accounts), **dict(of_services)}
+        return [values[axis] for axis in self.axes]

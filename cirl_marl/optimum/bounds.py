@@ -337,6 +337,28 @@ def highest_service(network: Network) -> float:
     return 1.0 - _least_cut(problem, range(len(network.services)))
 
 
+def highest_level(
+    network: Network, service: int, min_service: Floats, at_most: Mapping[str, float] | None = None
+) -> float:
+    """Return the highest mean level that a program allows one service, beside what is demanded of the others.
+
+    Args:
+        network: from the middle of the initial ranges.
+        service: its position.
+        min_service: demanded of the others, shape (services,).
+        at_most: budgets, as for ``bound``.
+
+    Raises:
+        NoCertificate: for a network whose flows are not linear laws.
+        Infeasible: if the others cannot have what is demanded of them.
+    """
+    admissible, demand = Admissible.of(network), min_service.copy()
+    demand[service], others = 1.0, np.delete(np.arange(len(demand)), service)
+    start = starting_stocks(admissible.lifetimes, None)
+    problem = Programs(admissible, DEGREE, None).program(start, demand, aims=aims_of(network, CIRCULARITY, at_most))
+    return 1.0 - _least_cut(problem, [service], others.tolist())
+
+
 def _episode_network(network: str | Path | Network, scenario: str | None, horizon: int | None) -> Network:
     definition = load_network(network) if isinstance(network, str | Path) else network
     definition = definition.scenario(scenario)
@@ -448,12 +470,15 @@ def _unreached_services(problem: Program, min_service: Floats | None) -> str:
     return f"network '{network.name}': no actions reach a mean service level of {', '.join(levels)}{suffix}"
 
 
-def _least_cut(problem: Program, services: Sequence[int]) -> float:
-    """Return the least number by which the levels demanded of ``services``, of no others, are lowered within reach."""
+def _least_cut(problem: Program, services: Sequence[int], beside: Sequence[int] = ()) -> float:
+    """Return the least number by which the levels demanded of ``services`` are lowered within reach.
+
+    Levels demanded of services ``beside`` these stay; of all else nothing is demanded.
+    """
     first = len(problem.under_to) - len(problem.layout.network.services)
-    rows = [*range(first), *(first + s for s in services)]
+    rows = [*range(first), *(first + s for s in (*beside, *services))]
     # minimise t, one more variable, with mean level + t ≥ demanded level
-    allowance = sparse.csr_array((np.arange(len(rows)) >= first)[:, None] * -1.0)
+    allowance = sparse.csr_array((np.arange(len(rows)) >= first + len(beside))[:, None] * -1.0)
     cut = replace(
         problem,
         cost=np.append(np.zeros_like(problem.cost), 1.0),

@@ -271,7 +271,7 @@ def idle_supplies(admissible: Admissible, reach: Reach, intervals: range, rows: 
     low, high = admissible.setting[:, period]
     shortage = np.where(reach.uncut, 0.0, high)
     t = np.arange(len(intervals))[:, None]
-    for arcs, weight in _idle_groups(admissible):
+    for arcs, weight in idle_groups(admissible):
         room = np.where(weight > 0, (high - low)[:, arcs], 0.0)  # of weight 0 never more than the least
         latest = np.divide(room, weight, out=np.full_like(room, -1.0), where=weight > 0)
         place = latest.argmax(axis=1)[:, None]
@@ -310,7 +310,7 @@ def least_deliveries(admissible: Admissible, reach: Reach, intervals: range, row
         rows.put(row, t * layout.size + layout.flow[piece * (layout.degree + 1)] + k, -1.0)
 
 
-def _idle_groups(admissible: Admissible) -> list[tuple[Integers, Floats]]:
+def idle_groups(admissible: Admissible) -> list[tuple[Integers, Floats]]:
     """Return the idle arcs of each service that several make up for, with their weights w.
 
     Each component has arcs of its own, which carry the part of w that they have of what is supplied. Left out are those

@@ -210,7 +210,7 @@ class Programs:
         steps, period, lifetimes = len(intervals), slice(intervals.start, intervals.stop), admissible.lifetimes
         if admissible.mixtures is not None:
             check_contents(lifetimes.network, admissible.mixtures, lifetimes.state_layout, initial)
-        reach, lifetime_flow = _reach(lifetimes, self.system, initial, intervals)
+        reach, lifetime_flow = possible_range(lifetimes, self.system, initial, intervals)
         changes, mixtures = ~reach.uncut, admissible.mixtures
         if mixtures is not None:
             changes[:, mixtures.arcs[:, mixtures.varies].ravel()] = True  # a content, as if they were cut
@@ -259,7 +259,9 @@ class Programs:
         )
 
 
-def _reach(lifetimes: Lifetimes, system: ComparisonSystem, initial: Floats, intervals: range) -> tuple[Reach, Floats]:
+def possible_range(
+    lifetimes: Lifetimes, system: ComparisonSystem, initial: Floats, intervals: range
+) -> tuple[Reach, Floats]:
     """Return what the planned network can reach, and the most that leaves lifetimes, shape (steps, lifetimes)."""
     interval, steps = lifetimes.network.episode.control_interval, range(len(intervals))
     lines = [(whole, whole.slots(initial)) for whole in lifetimes.whole if not len(whole.rate)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -107,26 +108,30 @@ def _by_compartment(simulation: Simulation, account: int) -> list[tuple[str, lis
 
 
 def front_table(front: AccountFront) -> Table:
-    """Return budgets, what is proved and planned at each, and what one more of the budget is worth."""
-    (first, second), (unit, other) = front.axes, front.units
-    headings = [
-        f"{second} at most ({other})",
-        f"best {first} ({unit})",
-        f"plan ({unit})",
-        f"worth ({unit} per {other})",
-    ]
-    columns = (front.budgets, front.bounds, front.plans[:, 0], front.prices)
-    rows = [[f"{cell:.5g}" for cell in cells] for cells in zip(*(column.tolist() for column in columns), strict=True)]
-    return text_table(f"{first} against {second}", headings, rows, text=[])
+    """Return demands, what is proved and planned at each, and what one more of each demand is worth."""
+    headings = [name for name, _ in _front_columns(front)]
+    columns = [column.tolist() for _, column in _front_columns(front)]
+    rows = [[f"{cell:.5g}" for cell in cells] for cells in zip(*columns, strict=True)]
+    return text_table(f"{front.axes[0]} against {' and '.join(front.axes[1:])}", headings, rows, text=[])
+
+
+def _front_columns(front: AccountFront) -> list[tuple[str, Floats]]:
+    """Return the columns of the table of a front, with their headings."""
+    (first, *others), (unit, *units) = front.axes, front.units
+    demanded = ["at least" if sign > 0 else "at most" for sign in front.signs[1:]]
+    named = [*zip(others, units, strict=True)]
+    headings = [f"{name} {way} ({of})" for (name, of), way in zip(named, demanded, strict=True)]
+    columns = [*zip(headings, front.demands.T, strict=True), (f"best {first} ({unit})", front.bounds)]
+    names = [f"plan: {name} ({of})" for name, of in [(first, unit), *named]]
+    worth = [f"worth of {name} ({unit}/({of}))" for name, of in named]
+    return [*columns, *zip(names, front.plans.T, strict=True), *zip(worth, front.prices.T, strict=True)]
 
 
 def write_account_front(front: AccountFront, folder: Path, **options: Any) -> list[Path]:
     """Write table, provenance and picture, all of them or none, and return their paths."""
-    (first, second), (unit, other) = front.axes, front.units
-    header = [f"budget of {second} ({other})", f"proved {first} ({unit})", f"worth of one more ({unit}/({other}))"]
-    header += [f"planned {first} ({unit})", f"planned {second} ({other})", "least service level of the plan"]
-    columns = [front.budgets, front.bounds, front.prices, *front.plans.T, front.levels]
-    rows = [list(row) for row in zip(*(column.tolist() for column in columns), strict=True)]
+    columns = [*_front_columns(front), ("least service level of the plan", front.levels)]
+    header = [name for name, _ in columns]
+    rows = [list(row) for row in zip(*(column.tolist() for _, column in columns), strict=True)]
     bounds, plans = front.volumes
     about: dict[str, Any] = {"provenance": provenance(front.network, **options), "columns": header, "points": rows}
     about |= {"as_usual": front.as_usual.tolist(), "hypervolume": {"proved": bounds, "plans": plans}}
@@ -139,19 +144,32 @@ def write_account_front(front: AccountFront, folder: Path, **options: Any) -> li
 
 
 def save_account_front(path: str | Path, front: AccountFront, *, title: str = "") -> Path:
-    """Save two aims against each other as a PNG and return its path; what no episode can reach is shaded."""
-    (first, second), (unit, other), network = front.axes, front.units, front.network
+    """Save the first two aims against each other as a PNG and return its path; a third has a line for each demand.
+
+    Of two aims what no episode can reach is shaded.
+    """
+    (first, second), (unit, other), network = front.axes[:2], front.units[:2], front.network
     figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
     axes = figure.subplots()
-    axes.plot(*front.plans.T[::-1], marker="o", color=SERIES[0], label="plan in the simulator")
-    axes.plot(*front.as_usual[::-1], marker="s", linestyle="", color=SERIES[1], label="as usual")
-    within = np.linspace(*axes.get_xlim(), 500)
-    bounds = front.at(within)
-    axes.plot(within, bounds, color=NEUTRAL, linewidth=1, label="best possible")
-    low, high = axes.get_ylim()
-    axes.fill_between(within, bounds, high if front.sign > 0 else low, color=NEUTRAL, alpha=0.2, linewidth=0)
-    axes.set_ylim(low, high)
-    axes.set_xlim(within[0], within[-1])
+    thirds = np.unique(front.demands[:, 1:]).tolist() or [None]
+    for third, colour in zip(thirds, cycle(SERIES[1:] if len(thirds) > 1 else SERIES), strict=False):
+        part = np.flatnonzero((front.demands[:, 1:] == third).all(axis=1))
+        order = part[np.argsort(front.demands[part, 0])]
+        label = "plan in the simulator" if third is None else f"{readable(front.axes[2])} {number(third)}"
+        axes.plot(*front.plans[order, :2].T[::-1], marker="o", color=colour, label=label)
+        if third is not None:
+            axes.plot(front.demands[order, 0], front.bounds[order], color=colour, linewidth=1, linestyle="--")
+    axes.plot(*front.as_usual[:2][::-1], marker="s", linestyle="", color=INK, label="as usual")
+    if thirds == [None]:
+        within = np.linspace(*axes.get_xlim(), 500)
+        bounds = front.at(within)
+        axes.plot(within, bounds, color=NEUTRAL, linewidth=1, label="best possible")
+        low, high = axes.get_ylim()
+        axes.fill_between(within, bounds, high if front.signs[0] > 0 else low, color=NEUTRAL, alpha=0.2, linewidth=0)
+        axes.set_ylim(low, high)
+        axes.set_xlim(within[0], within[-1])
+    else:
+        axes.plot([], [], color=NEUTRAL, linewidth=1, linestyle="--", label="best possible")
     label = "λ̄" if first == CIRCULARITY else readable(first)
     style_axes(axes, title=title or f"{network.title or network.name}", ylabel=f"{label} / {unit}")
     axes.set_xlabel(f"{readable(second)} / {other}", fontsize=9)

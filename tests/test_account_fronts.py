@@ -1,0 +1,166 @@
+"""Two and three aims against each other: proved and achieved fronts, their volumes, and limits of idle supplies."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_networks import city, with_lambda
+from test_supply import town
+from typer.testing import CliRunner
+
+from cirl_marl import CirlError, MultiAgentVectorEnv, Network, account_front, load_network, write_network
+from cirl_marl.cli import app
+from cirl_marl.controllers import Constant
+from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
+from cirl_marl.evaluation.account_front import volume_dominated
+from cirl_marl.network.elements import Role
+from cirl_marl.optimum import bound, improve_plan, simulate_plan, supply_limits
+from cirl_marl.optimum.supply_limits import with_supply_limits
+
+
+@pytest.mark.slow
+def test_the_front_of_two_aims_is_proved_and_reached(tmp_path: Path) -> None:
+    """Plans lie on the worse side of the front and near it; prices are its slope; both have a hypervolume."""
+    file = tmp_path / "city.toml"
+    write_network(city(), file)
+    for axes in (("circularity", "emissions"), ("cost", "emissions")):
+        front = account_front(file, axes, min_service=0.9, points=4)
+        at_plans = front.at(front.plans[:, 1:])
+        assert (front.signs[0] * (at_plans - front.plans[:, 0]) >= -1e-5 * abs(at_plans)).all()
+        np.testing.assert_allclose(front.at(front.demands), front.bounds, rtol=1e-4)
+        assert (np.diff(front.prices[:, 0]) <= 1e-6 * front.prices[0]).all() and front.prices[0] > 0
+        assert (front.plans[:, 1] <= front.demands[:, 0] * (1 + 1e-4)).all() and (front.levels <= 1).all()
+        proved, achieved = front.volumes
+        assert 0.99 * proved <= achieved <= proved * (1 + 1e-5)
+        assert replace(front, shortages=np.ones(4)).volumes == (proved, 0.0)
+    out = ["--min-service", "0.9", "--points", "3", "--out", str(tmp_path / "front")]
+    result = CliRunner().invoke(app, ["pareto", str(file), "--between", "cost,emissions", *out])
+    assert result.exit_code == 0, result.output
+    with (tmp_path / "front" / "pareto.csv").open(encoding="utf-8") as lines:
+        assert len(list(csv.reader(lines))) == 4
+    assert (tmp_path / "front" / "pareto.png").stat().st_size > 1000
+    with pytest.raises(CirlError, match="nothing to weigh"):
+        account_front(with_lambda(load_network("paper_city")), ("circularity", "moved"), min_service=0.9)
+    with pytest.raises(CirlError, match="nothing to weigh"):  # less ore is less of both
+        account_front("copper_world", ("circularity", "emissions"), min_service=1.0)
+
+
+@pytest.mark.slow
+def test_the_front_of_three_aims_is_proved_and_reached(tmp_path: Path) -> None:
+    """Each service level has a front of its own, whose plans no plane cuts off; the slopes are those of programs."""
+    network = city().with_options(episode={"horizon": 20})
+    file, folder = tmp_path / "city.toml", tmp_path / "front"
+    write_network(network, file)
+    (service,) = network.services
+    front = account_front(network, ("circularity", "emissions", service.id), points=3)
+    assert front.demands.shape == (9, 2) and len(np.unique(front.demands[:, 1])) == 3
+    assert (front.plans[:, 2] >= front.demands[:, 1] - 1e-3).all()
+    gap = front.at(front.plans[:, 1:]) - front.plans[:, 0]
+    assert (gap >= -1e-6 * abs(front.plans[:, 0])).all()
+    np.testing.assert_allclose(front.at(front.demands), front.bounds, rtol=1e-4, atol=1e-4)
+    assert (front.prices[:, 0] >= 0).all() and (front.prices[:, 1] <= 0).all()
+    budget, level = front.demands[4]
+    for shift, price in zip(np.diag([1e-3 * budget, 1e-3]), front.prices[4], strict=True):
+        ends = [(budget, level) + way * shift for way in (-1, 1)]
+        solved = [bound(network, at_most={"emissions": e}, min_service=m).objective for e, m in ends]
+        slopes = np.diff([solved[0], front.bounds[4], solved[1]]) / shift.sum()
+        assert slopes.min() - 1e-2 * abs(price) <= price <= slopes.max() + 1e-2 * abs(price)
+    proved, achieved = front.volumes
+    assert 0.98 * proved <= achieved <= proved * (1 + 1e-4)
+    words = ["pareto", str(file), "--between", f"circularity,emissions,{service.id}", "--points", "3"]
+    result = CliRunner().invoke(app, [*words, "--out", str(folder)])
+    assert result.exit_code == 0, result.output
+    with (folder / "pareto.csv").open(encoding="utf-8") as lines:
+        header, *rows = csv.reader(lines)
+    assert f"{service.id} at least (1)" in header and "emissions at most (t CO2e)" in header
+    np.testing.assert_allclose(np.array(rows, dtype=float)[:, :2], front.demands, rtol=1e-6)
+    volumes = json.loads((folder / "pareto.json").read_text(encoding="utf-8"))["hypervolume"]
+    assert volumes["plans"] == pytest.approx(achieved, rel=1e-6)
+
+
+@pytest.mark.parametrize("aims", [1, 2, 3])
+def test_volumes_are_those_of_random_points(aims: int) -> None:
+    """The part of random points that some of the front dominates."""
+    rng = np.random.default_rng(aims)
+    points, samples = rng.uniform(-0.2, 1.0, (6, aims)), rng.uniform(0.0, 1.0, (100_000, aims))
+    share = np.mean(np.any(np.all(samples[:, None] < points, axis=2), axis=1))
+    assert volume_dominated(points, np.zeros(aims)) == pytest.approx(share, abs=5e-3)
+    assert volume_dominated(points, np.full(aims, 2.0)) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("axes", "message"),
+    [
+        (("circularity", "emisions"), "Did you mean 'emissions'"),
+        (("cost", "circularity"), "then one or two other accounts or services"),
+        (("cost", "cost"), "then one or two other"),
+        (("circularity",), "then one or two other"),
+        (("circularity", "emissions"), "give min_service, at which they are weighed, of"),
+    ],
+)
+def test_aims_that_cannot_be_weighed(axes: tuple[str, ...], message: str) -> None:
+    """The message names them, the nearest ones, and what is missing."""
+    with pytest.raises(CirlError, match=message):
+        account_front(city(), axes)
+
+
+def two_sources() -> Network:
+    """Return a town in which the source that counts in λ comes to its end first; nobody chooses among the two."""
+    network = replace(town((0.9, 0.1), high=(200.0, 999.0)), default_agents=("import",))
+    nodes = {node.id: node for node in network.nodes}
+    nodes["ore_b"] = replace(nodes["ore_b"], role=Role.TECHNOSPHERE, initial=(5000.0, 5000.0))
+    return replace(network, nodes=tuple(nodes.values()))
+
+
+def test_idle_supplies_of_good_episodes_share_what_is_asked_for() -> None:
+    """The program of all episodes draws on the source that does not count; that of good ones on both, by weight."""
+    network = two_sources()
+    loose = bound(network, min_service=0.999)
+    mined = loose.flow[:, :2] - 1.0
+    assert (mined[:, 1] > 0.2 * mined[:, 0] + 0.1).any()
+    run = simulate_plan(improve_plan(loose))
+    narrow = with_supply_limits(loose, float(run.episode_circularity[0]))
+    tight = bound(narrow, min_service=0.999)
+    mined = tight.flow[:, :2] - 1.0
+    np.testing.assert_allclose(mined[:, 1], mined[:, 0] / 9, atol=1e-6)
+    assert tight.objective < loose.objective
+
+
+def test_good_episodes_stay_what_they_are_under_limits() -> None:
+    """Whatever agents do: an episode at least as good as was asked for is the same in the narrower network."""
+    network = two_sources()
+    actions = np.random.default_rng(3).uniform(-1.0, 0.0, 12).tolist()
+    least = float(np.median([middle_episode(network, action).episode_circularity[0] for action in actions]))
+    narrow = with_supply_limits(bound(network, min_service=0.5), least)
+    ends = [n.control_bounds[2, n.control_rows["mine_b"].start] for n in (network, narrow)]
+    assert (ends[1] < ends[0]).all()
+    good = 0
+    for action in actions:
+        run = middle_episode(network, action)
+        if run.episode_circularity[0] >= least and run.least_service[0] >= 0.5:
+            np.testing.assert_allclose(run.flow, middle_episode(narrow, action).flow, rtol=1e-9)
+            good += 1
+    assert 1 <= good < 12
+
+
+def middle_episode(network: Network, action: float) -> Rollout:
+    """Return the episode from the middle of the initial ranges in which imports are constant."""
+    env = MultiAgentVectorEnv(network, num_envs=1)
+    origin = episode_start(env)
+    return rollout(env, Constant({"import": action}), seed=origin.seed, start=origin.initial_state)
+
+
+def test_nothing_is_limited_where_nothing_is_proved(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of episodes however bad, of one supply alone, and of programs that are too large."""
+    network = two_sources()
+    solution = bound(network, min_service=0.999)
+    assert with_supply_limits(solution, -1e6) == network
+    alike = replace(town((0.5, 0.5)), default_agents=("import",))
+    assert with_supply_limits(bound(alike, min_service=0.999), -1e6) == alike
+    monkeypatch.setattr(supply_limits, "LARGE", 1)
+    assert with_supply_limits(solution, solution.objective) is network
