@@ -35,6 +35,7 @@ from cirl_marl import (
 from cirl_marl.cli import app
 from cirl_marl.controllers import Random
 from cirl_marl.controllers.rollout import Rollout, rollout
+from cirl_marl.network.disturbances import AutoRegression, DisturbanceEffect
 from cirl_marl.optimum import improve, improve_plan, simulate_plan, smooth_plan
 from cirl_marl.optimum.aims import aims_of, budget_texts
 
@@ -177,13 +178,72 @@ def test_budgets_per_year_that_cannot_be_meant_are_refused() -> None:
     with pytest.raises(CirlError, match=r"the budget of emissions in year 1 at most .*\(at least .*emissions in year"):
         bound(network, min_service=0.95, at_most={"emissions/year": 0.5 * least})
     assert bound(network, aim="emissions", min_service=0.95, at_most={"emissions/year": 1.01 * least}).verify()
-    env = MultiAgentVectorEnv(network, num_envs=1)
-    with pytest.raises(CirlError, match="MPC: no budget per year, as of emissions in year 1, can be kept: plans know"):
+    disturbances = {"demand": AutoRegression(deviation=0.3, persistence=0.8, low=0.5, high=1.6)}
+    effect = {f"services.{network.services[0].id}.low": DisturbanceEffect(by="demand")}
+    env = MultiAgentVectorEnv(replace(network, disturbances=disturbances, disturbed=effect), num_envs=1)
+    with pytest.raises(CirlError, match="MPC: no budget per year, as of emissions in year 1, can be kept: what is"):
         MPC(min_service=0.9, at_most={"emissions/year": 1e9}).start(env, 0)
     given = load_recipe("exact_gradients")
     recipe = given.model_copy(update={"run": given.run.model_copy(update={"at_most": {"emissions/year": 1e9}})})
     with pytest.raises(CirlError, match=r"run\.at_most: no budget per year, as of emissions in year 1, can be kept"):
         train(network, recipe, steps=1000)
+
+
+def quarterly(horizon: int = 8) -> Network:
+    """Return the city with a quarter of a year in place of a day, and costs that are discounted."""
+    network = city().with_options(episode={"horizon": horizon, "control_interval": 365.25 / 4})
+    return replace(network, accounts=tuple(replace(each, discount=0.5) for each in ACCOUNTS))
+
+
+@pytest.mark.parametrize(("replan", "share"), [(1, None), (3, 0.9)])
+def test_mpc_keeps_budgets_per_year(replan: int, share: float | None) -> None:
+    """In each copy and in each of its episodes; beside one of the episode, which is discounted."""
+    network = quarterly()
+    least = simulate_plan(bound(network, aim="emissions", min_service=0.9)).bookings[0, 1].reshape(2, 4).sum(axis=1)
+    budgets = {"emissions/year": 1.6 * float(least.max())}
+    total = float(bound(network, min_service=0.9, at_most=budgets).accounts[1])
+    budgets |= {} if share is None else {"emissions": share * total}
+    env = MultiAgentVectorEnv(network, num_envs=2)
+    env.reset(seed=3)
+    control = MPC(min_service=0.9, at_most=budgets, replan=replan)
+    control.start(env, 3)
+    amounts = np.zeros((2, 8, 2))
+    totals = np.zeros((2, 2))
+    for episode, step in np.ndindex(2, 8):
+        outcome = env.step(control.act({}))
+        infos = outcome[-1][env.agents[0]]
+        amounts[episode, step] = infos["accounts"]["emissions"]
+        if step == 7:
+            totals[episode] = infos["episode_emissions"]
+    booked = amounts.reshape(2, 2, 4, 2).sum(axis=2)
+    assert (booked <= budgets["emissions/year"] * (1 + 1e-4)).all()
+    if share is None:
+        assert (booked > 0.99 * budgets["emissions/year"]).all()
+    else:
+        assert (booked.max(axis=1) > 0.99 * budgets["emissions/year"]).all()
+        assert (totals <= budgets["emissions"] * (1 + 1e-4)).all() and (totals > 0.99 * budgets["emissions"]).all()
+
+
+def test_what_a_plan_books_beyond_its_program_is_of_the_years_that_count() -> None:
+    """So that the next program has less of the same year."""
+    network = quarterly()
+    plan = first_window(MPC(min_service=0.9, at_most={"emissions/year": 1e4, "emissions": 1.5e4}), network)
+    (correction,) = plan.corrections
+    assert correction.excess.shape == (8, 3)
+    assert (correction.excess[4:, 0] == 0).all() and (correction.excess[:4, 1] == 0).all()
+    assert (correction.excess[:4, 0] != 0).all() and (correction.excess[:, 2] != 0).all()
+
+
+def test_budgets_per_year_need_every_interval() -> None:
+    """What was booked in an interval that MPC did not see is of no year."""
+    env = MultiAgentVectorEnv(quarterly(), num_envs=1)
+    env.reset(seed=0)
+    control = MPC(min_service=0.5, at_most={"emissions/year": 1e5})
+    control.start(env, 0)
+    for _ in range(2):
+        env.step(env.neutral_action)
+    with pytest.raises(CirlError, match="budgets per year need every interval"):
+        control.act({})
 
 
 def test_intervals_are_of_the_year_of_their_middle() -> None:

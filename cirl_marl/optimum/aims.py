@@ -93,18 +93,23 @@ class Aims:
                 column[:] = run.bookings[:, budget.account, budget.year].sum(axis=1)
         return amounts
 
+    def counts(self, ledger: Ledger) -> Floats:
+        """Return by which amounts of each interval count in each budget, shape (budgets, horizon)."""
+        table = np.zeros((len(self.budgets), ledger.discount.shape[1]))
+        for count, budget in zip(table, self.budgets, strict=True):
+            if budget.year is None:
+                count[:] = ledger.discount[budget.account]
+            else:
+                count[budget.year] = 1.0
+        return table
+
     def rates(self, network: Network) -> RateTables:
         """Return what is booked of each budget by mean flows and by mean stocks of each interval.
 
         Shapes are (budgets, horizon, arcs) and (budgets, horizon, stores).
         """
         ledger, accounts = Ledger(network), [budget.account for budget in self.budgets]
-        counts = np.zeros((len(accounts), ledger.discount.shape[1], 1))
-        for count, budget in zip(counts[..., 0], self.budgets, strict=True):
-            if budget.year is None:
-                count[:] = ledger.discount[budget.account]
-            else:
-                count[budget.year] = 1.0
+        counts = self.counts(ledger)[:, :, None]
         by_flow, by_stock = (rates[accounts] * counts for rates in ledger.rates(with_discount=False))
         return by_flow, by_stock
 

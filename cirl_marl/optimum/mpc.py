@@ -34,7 +34,7 @@ from cirl_marl.network.elements import CIRCULARITY, is_of_circularity
 from cirl_marl.network.innovations import innovations
 from cirl_marl.network.uncertainty import expected_network
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.aims import Aim, aims_of
+from cirl_marl.optimum.aims import Aim, Aims, aims_of
 from cirl_marl.optimum.draws import Prices
 from cirl_marl.optimum.futures import DrawnFutures
 from cirl_marl.optimum.options import check_margin, check_options, demanded_levels, starting_stocks, with_margin
@@ -74,6 +74,41 @@ class _Demands:
         default_factory=lambda: EMPTY
     )
     charges: Annotated[Floats, "of totals, in parts of budgets; empty for none"] = field(default_factory=lambda: EMPTY)
+
+
+class _Bookings:
+    """What was booked of each budget in each copy, followed from interval to interval for those per year."""
+
+    def __init__(self, aims: Aims, env: MultiAgentVectorEnv) -> None:
+        """Begin with what the episodes of ``env`` have booked so far; of years it is what comes from now on."""
+        self._aims, self._env, self._counts = aims, env, aims.counts(env.ledger)
+        self._accounts = [budget.account for budget in aims.budgets]
+        self._by_year = np.flatnonzero([budget.year is not None for budget in aims.budgets])
+        self._step, self._totals = env.physical.step.copy(), env.physical.accounts.copy()
+        self._in_years = np.zeros((len(self._by_year), env.num_envs))
+
+    def follow(self, is_new: Sequence[bool]) -> None:
+        """Take what the interval before booked in each copy, or nothing where an episode is new.
+
+        Raises:
+            ControlError: if a budget is per year and an interval was left out.
+        """
+        state, ledger = self._env.physical, self._env.ledger
+        moved = np.flatnonzero((state.step != self._step) & ~np.array(is_new))
+        if len(self._by_year) and (state.step[moved] != self._step[moved] + 1).any():
+            raise ControlError("MPC: budgets per year need every interval of an episode, from its start on")
+        before, accounts = self._step[moved], np.array(self._accounts, dtype=np.intp)[self._by_year]
+        change = (state.accounts - self._totals)[accounts][:, moved]
+        amounts = change / ledger.discount[accounts][:, before]
+        self._in_years[:, moved] += amounts * self._counts[self._by_year][:, before]
+        self._in_years[:, is_new] = 0.0
+        self._step, self._totals = state.step.copy(), state.accounts.copy()
+
+    def remainders(self, copy: int) -> Floats:
+        """Return what is left of each budget, shape (budgets,)."""
+        remainder = self._aims.limits - self._totals[self._accounts, copy]
+        remainder[self._by_year] = self._aims.limits[self._by_year] - self._in_years[:, copy]
+        return remainder
 
 
 class MPC(Planner):
@@ -119,7 +154,7 @@ class MPC(Planner):
                 ``service_weight``.
             service_weight: w ≥ 0; goes with the aim ``circularity``.
             aim: see ``bound``.
-            at_most: budgets of episodes, likewise; in a certain network without a ``horizon``.
+            at_most: budgets, likewise; in a certain network without a ``horizon``, per year in no other.
             degree: degree of the test polynomials; see ``bound``.
             replan: decisions carried out of each plan; None: 4, in a disturbed network 1.
             futures: how many are drawn at every decision in a disturbed network; None: one, in which all is as it is
@@ -168,7 +203,8 @@ class MPC(Planner):
             raise CirlError(f"network '{env.network.name}': {fault}; take 'optimum' or a learner")
         network, (horizon, replan, futures) = env.network, self._options
         self._aims = aims = aims_of(network, self._aim, self._at_most)
-        aims.refuse_years("MPC", "plans know what is left of a total, not of a year; take optimum control")
+        if network.disturbed:
+            aims.refuse_years("MPC", "what is charged for in a disturbed network is a total; take optimum control")
         self._levels = None if self._min_service is None else demanded_levels(network, self._min_service)
         self.note, self._env, is_disturbed = "", env, bool(network.disturbed)
         if self._prices is not None and len(self._prices.service) > len(network.services):
@@ -189,6 +225,7 @@ class MPC(Planner):
         self._outlooks: dict[int, WindowPlan] = {}
         self._common_outlook: WindowPlan | None = None
         self._price = np.zeros(0)
+        self._bookings = _Bookings(aims, env)
         is_short = self._horizon is not None and self._horizon < network.episode.horizon
         if is_disturbed and (is_short or self._levels is not None or aims.budgets):
             self._common_outlook = outlook = self._expected_outlook()
@@ -230,6 +267,7 @@ class MPC(Planner):
         over = [
             new or not 0 <= step - p.first < len(p.actions) for new, step, p in zip(is_new, steps, plans, strict=True)
         ]
+        self._bookings.follow(is_new)
         self._look_ahead(copies := np.flatnonzero(over).tolist())
         for copy in copies:
             plans[copy] = self._next(copy, None if is_new[copy] else plans[copy])
@@ -259,8 +297,7 @@ class MPC(Planner):
         if self._levels is not None:
             deficit = self._levels * steps - state.service[:, copy]
         if outlook is None:
-            left = self._aims.limits - state.accounts[[budget.account for budget in self._aims.budgets], copy]
-            demands = _Demands(deficit, left / self._aims.sizes)
+            demands = _Demands(deficit, self._bookings.remainders(copy) / self._aims.sizes)
         else:  # no level is demanded, all that lacks has its price
             deficit = None if deficit is None else np.full(len(deficit), float(len(rest)))
             demands = _Demands(deficit, charges=outlook.charges)

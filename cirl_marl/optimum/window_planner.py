@@ -113,10 +113,11 @@ class Future:
         self._shift = 0
         self.aims: Aims = aims if like is None else like.aims
         self._budgets = [budget.account for budget in self.aims.budgets]
-        self._ledger, self._discount = None, EMPTY
+        self._ledger, self._discount, self._counts = None, EMPTY, EMPTY
         if not self.aims.is_circular or self._budgets:
             self._ledger = Ledger(network)
             self._discount = self._ledger.discount if like is None else like._discount
+            self._counts = self.aims.counts(self._ledger) if like is None else like._counts
             self._rate_tables: RateTables = self._ledger.rates(with_discount=False)
         if like is None:
             self._programs = Programs(admissible, degree, service_weight, constant_shares=False)
@@ -148,11 +149,14 @@ class Future:
         problem = self._programs.program(task.stock, None, places)
         layout, steps = problem.layout, len(task.intervals)
         cost = problem.cost * (steps / self.horizon)
-        if (rates := self._rates(task.intervals)) is not None:
+        if self._ledger is not None:
+            rates = self._rates(task.intervals, slice(None), self._discount)
             totals = account_rows(admissible.lifetimes, layout, task.stock, rates)[0].toarray()
             cost = -self.aims.objective(-cost, totals)
             if len(task.charges):
-                cost += (task.charges / self.aims.sizes) @ totals[self._budgets]
+                rates = self._rates(task.intervals, self._budgets, self._counts)
+                totals = account_rows(admissible.lifetimes, layout, task.stock, rates)[0].toarray()
+                cost += (task.charges / self.aims.sizes) @ totals
         cost = cost.reshape(steps, -1)
         if task.later is not None:
             cost += task.later.costs
@@ -173,26 +177,24 @@ class Future:
             problem = replace(problem, equal=equal, equal_to=equal_to, low=low, under_to=under_to)
         return problem if task.later is None else with_distance(problem, task.later)
 
-    def _rates(self, intervals: range) -> RateTables | None:
-        """Return the rates of the accounts, discounted as in the episode; None if nothing is aimed at there."""
-        if self._ledger is None:
-            return None
-        places, discount = self._places(intervals), self._discount[:, intervals.start : intervals.stop, None]
-        by_flow, by_stock = (rates[:, places.start : places.stop] * discount for rates in self._rate_tables)
+    def _rates(self, intervals: range, accounts: slice | list[int], counts: Floats) -> RateTables:
+        """Return the rates of some accounts, times what amounts of each interval of the episode count."""
+        places, count = self._places(intervals), counts[:, intervals.start : intervals.stop, None]
+        by_flow, by_stock = (rates[accounts, places.start : places.stop] * count for rates in self._rate_tables)
         return by_flow, by_stock
 
     def booking_rows(self, problem: Program, task: WindowTask) -> tuple[Any, Floats]:
-        """Return rows of the totals of budgeted accounts over the variables of a program, and what they have beside.
+        """Return rows of what is booked of budgets over the variables of a program, and what they have beside.
 
         Both are in parts of the budgets; shapes are (budgets, variables) and (budgets,).
         """
-        rates = self._rates(task.intervals)
-        if rates is None:
+        if not self._budgets:
             return sparse.csr_array((0, len(problem.cost))), np.empty(0)
+        rates = self._rates(task.intervals, self._budgets, self._counts)
         totals, beside = account_rows(self.admissible.lifetimes, problem.layout, task.stock, rates)
         further = sparse.csr_array((len(self._budgets), len(problem.cost) - totals.shape[1]))
-        rows = sparse.diags_array(1.0 / self.aims.sizes) @ totals[self._budgets]
-        return sparse.hstack([rows, further], format="csr"), beside[self._budgets] / self.aims.sizes
+        rows = sparse.diags_array(1.0 / self.aims.sizes) @ totals
+        return sparse.hstack([rows, further], format="csr"), beside / self.aims.sizes
 
     def trial(self, problem: Program, plan: Floats, task: WindowTask) -> WindowTrial:
         """Carry a plan out in the simulator.
@@ -211,7 +213,9 @@ class Future:
         excess = np.zeros_like(bookings)
         if self._budgets:
             rows_of_totals, beside = self.booking_rows(problem, task)
-            excess += (bookings.sum(axis=0) - rows_of_totals @ plan - beside) / len(intervals)
+            is_counted = (self._counts[:, task.intervals.start : task.intervals.stop] != 0).T
+            more = bookings.sum(axis=0) - rows_of_totals @ plan - beside
+            excess += np.where(is_counted, more / np.maximum(is_counted.sum(axis=0), 1), 0.0)
         return WindowTrial(
             actions,
             value,
@@ -238,8 +242,9 @@ class Future:
             entries = self._ledger.entries(
                 np.ascontiguousarray(flows.T), stores[:, :-1], stores[:, 1:], np.array(intervals)
             )
-            accounts = self._ledger.sums(entries) * self._discount[:, task.intervals.start : task.intervals.stop]
-            bookings = (accounts[self._budgets] / self.aims.sizes[:, None]).T
+            amounts, period = self._ledger.sums(entries), slice(task.intervals.start, task.intervals.stop)
+            accounts = amounts * self._discount[:, period]
+            bookings = (amounts[self._budgets] * self._counts[:, period] / self.aims.sizes[:, None]).T
         value = self._value(task, flows, stocks[-1], np.minimum(level, 1.0), accounts.sum(axis=1))
         if len(task.charges):
             value -= float(task.charges @ bookings.sum(axis=0))

@@ -30,7 +30,10 @@ class Correction:
     """What became of a plan in the simulator, by interval."""
 
     error: Annotated[Floats, "(q̂ − q)/l of each service, shape (intervals, services)"]
-    excess: Annotated[Floats, "what was booked beyond the plan, evenly, in parts of budgets, (intervals, budgets)"]
+    excess: Annotated[
+        Floats,
+        "what was booked beyond the plan, evenly over those that count, in parts of budgets, (intervals, budgets)",
+    ]
     rate: Annotated[Floats, "flow over what drives it, planned, shape (intervals, arcs), 1/time"]
     valve: Annotated[Floats, "planned valve of each node, shape (intervals, nodes)"]
 
