@@ -17,10 +17,10 @@ from cirl_marl import CirlError, MultiAgentVectorEnv, Network, account_front, lo
 from cirl_marl.cli import app
 from cirl_marl.controllers import Constant
 from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
-from cirl_marl.evaluation.account_front import volume_dominated
+from cirl_marl.evaluation.account_front import _Sweep, volume_dominated
 from cirl_marl.network.elements import Role
 from cirl_marl.optimum import bound, improve_plan, simulate_plan, supply_limits
-from cirl_marl.optimum.supply_limits import with_supply_limits
+from cirl_marl.optimum.supply_limits import _with_ends, with_supply_limits
 
 
 @pytest.mark.slow
@@ -131,6 +131,20 @@ def test_idle_supplies_of_good_episodes_share_what_is_asked_for() -> None:
     assert tight.objective < loose.objective
 
 
+def test_points_worse_than_others_are_bounded_without_limits_of_supplies() -> None:
+    """Limits are none of episodes worse than where the others are best; and plans are carried out without any."""
+    network, levels = two_sources(), np.array([0.999, 0.9])
+    sweep = _Sweep(network, ("circularity", "living"), 3, np.array([0.999, 0.0]), lambda activity, share: None)
+    sweep.run(("circularity",), {}, levels)
+    sweep._least = 0.0
+    sweep.run(("circularity",), {}, levels)
+    tight, loose = (solution.objective for solution in sweep.solutions)
+    solved = bound(network, min_service=levels)
+    assert tight < loose == pytest.approx(solved.objective, rel=1e-9)
+    dry = replace(solved, network=_with_ends(network, {"mine_a": np.full(8, 1.5), "mine_b": np.full(8, 1.5)}))
+    np.testing.assert_array_equal(sweep._carried_out(dry).flow, simulate_plan(improve_plan(solved)).flow)
+
+
 def test_good_episodes_stay_what_they_are_under_limits() -> None:
     """Whatever agents do: an episode at least as good as was asked for is the same in the narrower network."""
     network = two_sources()
@@ -156,11 +170,15 @@ def middle_episode(network: Network, action: float) -> Rollout:
 
 
 def test_nothing_is_limited_where_nothing_is_proved(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of episodes however bad, of one supply alone, and of programs that are too large."""
+    """Of episodes however bad, of supplies that are alike or may run dry, and of programs that are too large."""
     network = two_sources()
     solution = bound(network, min_service=0.999)
     assert with_supply_limits(solution, -1e6) == network
     alike = replace(town((0.5, 0.5)), default_agents=("import",))
     assert with_supply_limits(bound(alike, min_service=0.999), -1e6) == alike
+    nodes = [replace(node, initial=(60.0, 60.0)) if node.id == "ore_a" else node for node in network.nodes]
+    scarce = replace(network, nodes=tuple(nodes))  # who is asked for more than it holds delivers less, at any V
+    poor = bound(scarce, min_service=0.5)
+    assert with_supply_limits(poor, 1.01 * poor.objective) == scarce
     monkeypatch.setattr(supply_limits, "LARGE", 1)
     assert with_supply_limits(solution, solution.objective) is network

@@ -32,7 +32,7 @@ from cirl_marl.evaluation import compare, solve_baseline
 from cirl_marl.evaluation.pareto import pareto_front
 from cirl_marl.optimum import Plan, bound, envelope, improve_plan, search, simulate_plan
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.bounds import highest_service
+from cirl_marl.optimum.bounds import highest_level, highest_service
 from cirl_marl.optimum.mpc import MPC
 from cirl_marl.optimum.open_loop import Optimum
 from cirl_marl.optimum.options import starting_stocks
@@ -145,6 +145,16 @@ def test_the_service_that_cannot_be_had_is_named() -> None:
     with pytest.raises(CirlError, match=rf"0\.4 of 'mobility' \(at most {together:.6g}\), 0\.4 of 'hou.* same time$"):
         bound(scarce, min_service=0.4)
     assert bound(scarce, min_service=together - 1e-6).levels == pytest.approx([together] * 2, abs=1e-4)
+
+
+def test_the_highest_level_of_a_service_beside_what_another_asks() -> None:
+    """The more of what is scarce homes have, the less there is for cars; a bit more has no solution."""
+    scarce = town(reserve=12.0, cars=0.0, homes=0.0)
+    most = [highest_level(scarce, 0, np.array([0.0, demand])) for demand in (0.0, 0.3, 0.5)]
+    assert most[0] > most[1] + 0.05 > most[2] + 0.1
+    assert bound(scarce, min_service=[most[1] - 1e-5, 0.3]).levels[1] >= 0.3 - 1e-5
+    with pytest.raises(CirlError, match="no actions reach"):
+        bound(scarce, min_service=[most[1] + 1e-4, 0.3])
 
 
 def test_mpc_approaches_one_demand_and_leaves_the_other() -> None:
