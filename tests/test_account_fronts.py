@@ -142,6 +142,7 @@ def test_points_worse_than_others_are_bounded_without_limits_of_supplies() -> No
     solved = bound(network, min_service=levels)
     assert tight < loose == pytest.approx(solved.objective, rel=1e-9)
     dry = replace(solved, network=_with_ends(network, {"mine_a": np.full(8, 1.5), "mine_b": np.full(8, 1.5)}))
+    sweep._programs = dry.network
     np.testing.assert_array_equal(sweep._carried_out(dry).flow, simulate_plan(improve_plan(solved)).flow)
 
 
