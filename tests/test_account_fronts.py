@@ -17,7 +17,7 @@ from cirl_marl import CirlError, MultiAgentVectorEnv, Network, account_front, lo
 from cirl_marl.cli import app
 from cirl_marl.controllers import Constant
 from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
-from cirl_marl.evaluation.account_front import _Sweep, volume_dominated
+from cirl_marl.evaluation.account_front import AccountFront, _Sweep, volume_dominated
 from cirl_marl.network.elements import Role
 from cirl_marl.optimum import bound, improve_plan, simulate_plan, supply_limits
 from cirl_marl.optimum.supply_limits import _with_ends, with_supply_limits
@@ -91,6 +91,23 @@ def test_volumes_are_those_of_random_points(aims: int) -> None:
     share = np.mean(np.any(np.all(samples[:, None] < points, axis=2), axis=1))
     assert volume_dominated(points, np.zeros(aims)) == pytest.approx(share, abs=5e-3)
     assert volume_dominated(points, np.full(aims, 2.0)) == 0.0
+
+
+def test_plans_that_do_more_than_is_demanded_dominate_no_more_than_is_proved() -> None:
+    """What planes prove where they are counts; by hand, with lines of slope 0 and −2 that meet at a level of 0.75."""
+    front = AccountFront(
+        network=city(),
+        axes=("circularity", city().services[0].id),
+        min_service=np.zeros(1),
+        demands=np.array([[0.5], [1.0]]),
+        bounds=np.array([-1.0, -1.5]),
+        prices=np.array([[0.0], [-2.0]]),
+        plans=np.array([[-1.25, 0.75], [-1.5, 1.0]]),
+        levels=np.array([0.75, 1.0]),
+        shortages=np.zeros(2),
+        as_usual=np.array([-9.0, 0.5]),
+    )
+    assert front.volumes == pytest.approx((0.5 * 0.25, 0.25 * 0.25))
 
 
 @pytest.mark.parametrize(

@@ -80,12 +80,14 @@ class AccountFront:
     def volumes(self) -> tuple[float, float]:
         """What proved points and plans dominate within the nadir of the proved ones: the hypervolumes.
 
-        Plans that are short of what is demanded do not count.
+        Points are proved at demands, and by planes where plans have less of an account or more of a service than
+        demanded. Plans that are short of what is demanded do not count.
         """
         proved = self.signs * np.column_stack([self.bounds, self.demands])
+        nadir, others = proved.min(axis=0), self.plans[:, 1:]
+        at_plans = self.signs * np.column_stack([self.at(others), others])
         plans = self.signs * self.plans[self.shortages <= SERVED]
-        nadir = proved.min(axis=0)
-        return volume_dominated(proved, nadir), volume_dominated(plans, nadir)
+        return volume_dominated(np.concatenate([proved, at_plans]), nadir), volume_dominated(plans, nadir)
 
 
 def volume_dominated(points: Floats, nadir: Floats) -> float:
