@@ -268,9 +268,43 @@ def with_substances(network: Network, seed: int) -> Network:
         for low, high in [ends[int(rng.integers(2))]]
     ]
     substances = tuple(Substance(id=name, scale=0.1) for name in names)
-    return replace(
+    network = replace(
         network, nodes=tuple(nodes), arcs=tuple(arcs), services=tuple(services), substances=substances, scenarios={}
     )
+    return with_changing_contents(network, seed) if rng.random() < 0.5 else network
+
+
+def with_changing_contents(network: Network, seed: int) -> Network:
+    """Return a network with substances into which a source gives what changes in time, as histories did."""
+    rng, length = np.random.default_rng([seed, 4]), network.episode.control_interval * network.episode.horizon
+    names = [substance.id for substance in network.substances]
+
+    def changing(begin: float, end: float) -> dict[str, Series]:
+        times = tuple(np.linspace(begin, end, 4).tolist())
+        table = rng.dirichlet([1.0] * (len(names) + 1), 4)[:, 1:] * rng.integers(2, size=(4, 1))
+        kinds = [str(rng.choice(["step", "linear"])) for _ in names]
+        table[0, 0] = 0.3
+        return {
+            name: Series(times=times, values=tuple(column.tolist()), interpolation=kind)
+            for name, column, kind in zip(names, table.T * 0.7, kinds, strict=True)
+        }
+
+    nodes = [
+        node if node.history is None else replace(node, content=changing(node.history.times[0], 0.0))
+        for node in network.nodes
+    ]
+    recipients = rng.choice([node.id for node in network.nodes], 2)
+    control = Control(kind=ControlKind.FLOW, low=0.0, neutral=5.0, high=float(rng.uniform(5, 50)))
+    arcs = (
+        Arc(id="quarried", donor="quarry", recipient=str(recipients[0]), law=Law.CONTROLLED, control=control),
+        Arc(id="dug", donor="quarry", recipient=str(recipients[1]), law=Law.EXOGENOUS, flow=float(rng.uniform(0, 20))),
+    )
+    quarry = Node(
+        id="quarry",
+        role=Role.NONRENEWABLE_RESERVOIR,
+        content=changing(0.0, length),
+    )
+    return replace(network, nodes=(*nodes, quarry), arcs=(*network.arcs, *arcs), scenarios={})
 
 
 def limited(arcs: list[Arc], holders: list[str], seed: int, length: float) -> list[Arc]:

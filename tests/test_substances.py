@@ -255,13 +255,19 @@ def test_contents_of_initial_stocks_are_drawn() -> None:
 
 
 def test_contents_that_no_stock_can_have_are_not_drawn() -> None:
-    """Nor are they disturbed in time."""
+    """Nor is it disturbed in time what is in a stock that others enter, or what a history was."""
     network, path = load_network(EXAMPLE), "nodes.wires.content.copper"
     with pytest.raises(NetworkError, match=r"some draws of its contents sum to 1\.5, more than 1; give ranges"):
         replace(network, uncertain={path: Spread(low=0.5, high=1.5, distribution="uniform")})
     ups = AutoRegression(mean=1.0, deviation=0.1, persistence=0.5, low=0.5, high=1.5)
+    disturbed = {"nodes.scrap.content.copper": DisturbanceEffect(by="ups")}
+    with pytest.raises(NetworkError, match="node 'scrap': content: arc 'shredded' enters it: a stock mixes what"):
+        replace(network, disturbances={"ups": ups}, disturbed=disturbed)
+    history = Series(times=(-30.0,), values=(10.0,))
+    nodes = tuple(replace(node, history=history) if node.id == "cars" else node for node in network.nodes)
+    disturbed = {"nodes.cars.content.copper": DisturbanceEffect(by="ups")}
     with pytest.raises(NetworkError, match="what is in a stock at the start cannot be disturbed in time, but drawn"):
-        replace(network, disturbances={"ups": ups}, disturbed={path: DisturbanceEffect(by="ups")})
+        replace(network, nodes=nodes, disturbances={"ups": ups}, disturbed=disturbed)
 
 
 def test_draws_of_releases_are_those_of_all_components() -> None:

@@ -84,6 +84,9 @@ class Adjoint:
         asked_rate = rate = dynamics.rate(inputs.controls, step, inputs.factors)
         if dynamics.capacities:
             dynamics.capacities.cut(rate := rate.copy(), stock, step, inputs.factors)
+        ordered_rate = rate
+        if dynamics.source_contents:
+            dynamics.source_contents.share_out(rate := rate.copy(), step, inputs.factors)
         if dynamics.slots is not None:
             stock = dynamics.slots.shift_slots(stock)
             dynamics.slots.set_outflows(stock, rate)
@@ -102,14 +105,16 @@ class Adjoint:
             rate_adjoint += adjoint
         if dynamics.slots is not None:
             stock_adjoint = dynamics.slots.pull_back(stock_adjoint, rate_adjoint)
-        by_capacity = None
+        by_limits = None if inputs.factors is None else np.zeros_like(inputs.factors)
+        if dynamics.source_contents:
+            dynamics.source_contents.pull_back(ordered_rate, step, inputs.factors, rate_adjoint, by_limits)
         if dynamics.capacities:
-            by_capacity = dynamics.capacities.pull_back(
-                asked_rate, inputs.stock, step, inputs.factors, rate_adjoint, stock_adjoint
+            dynamics.capacities.pull_back(
+                asked_rate, inputs.stock, step, inputs.factors, rate_adjoint, stock_adjoint, by_limits
             )
         by_controls, by_factors = self.rates.pull_back(inputs.controls, step, inputs.factors, rate_adjoint)
-        if by_capacity is not None and by_factors is not None:
-            by_factors += by_capacity
+        if by_limits is not None and by_factors is not None:
+            by_factors += by_limits
         return IntervalInputs(stock_adjoint, by_controls, by_factors)
 
     def _drivers(self, stock: Floats, rate: Floats, routes: IntervalRoutes | None) -> list[Floats]:

@@ -57,8 +57,9 @@ class Capacities:
         factors: Floats | None,
         adjoint: Floats,
         stock_adjoint: Floats,
-    ) -> Floats | None:
-        """Turn the adjoint of rates that were cut into that of stocks, in place, and return that of the factors.
+        factor_adjoint: Floats | None,
+    ) -> None:
+        """Turn the adjoint of rates that were cut into that of stocks and of the factors, in place.
 
         Args:
             rate: before they were cut, shape (arcs, B).
@@ -67,17 +68,15 @@ class Capacities:
             factors: on numbers that are not certain, shape (numbers, B).
             adjoint: of the rates that were carried; becomes that of those asked for.
             stock_adjoint: to which is added what the limits bring.
+            factor_adjoint: likewise, if there are factors.
         """
         rates, stocks = self._rates_in(step), self._stock_sum(stock)
         limit_rates = self._factors(rates, factors)
         by_limit = np.where(stocks * limit_rates < rate[self.arcs], adjoint[self.arcs], 0.0)
         adjoint[self.arcs] -= by_limit
         self._stock_sum.transpose().add_to(stock_adjoint, by_limit * limit_rates)
-        if factors is None:
-            return None
-        by_factor = np.zeros_like(factors)
-        self._factors.pull_back(np.broadcast_to(rates, stocks.shape) * stocks, by_limit, by_factor)
-        return by_factor
+        if factor_adjoint is not None:
+            self._factors.pull_back(np.broadcast_to(rates, stocks.shape) * stocks, by_limit, factor_adjoint)
 
     def _rates_in(self, step: Integers | None) -> Floats:
         """Return c in the interval of each copy, in the first one without it."""

@@ -78,7 +78,7 @@ class Dynamics(FlowLaws):
         self.taylor = Taylor(self, self.substep) if episode.solver == "exact" else None
         self.terms = self.taylor.terms if self.taylor is not None else 0
         self.capacities = Capacities(network, rows, self.factors.ranges)
-        self.scheduled = ScheduledFlows(self.staged_network, self.is_scheduled, self.driver, self.substep)
+        self.scheduled = ScheduledFlows(self, self.substep)
         shape = (rows.masses, len(network.arcs))
         self._outflow_sum = RowSum(rows.donors, np.arange(shape[1]), 1.0, shape)
         self._busiest = int(np.bincount(network.donors, minlength=1).max())
@@ -114,7 +114,7 @@ class Dynamics(FlowLaws):
                 f"network '{self.network.name}': advance needs step, the index of the control interval of each copy: "
                 f"time series and batches depend on it, those of arc '{self._needs_step[0]}' for one"
             )
-        rate = actual_rate = self.rate_within_capacities(stock, controls, step, factors)
+        rate = actual_rate = self.rate_of_components(stock, controls, step, factors)
         if self.slots is not None:
             stock = self.slots.shift_slots(stock)
             self.slots.set_outflows(stock, rate)
@@ -175,6 +175,15 @@ class Dynamics(FlowLaws):
             self.capacities.cut(rate, stock, step, factors)
         return rate
 
+    def rate_of_components(
+        self, stock: Floats, controls: Floats, step: Integers | None, factors: Floats | None
+    ) -> Floats:
+        """Return what ``rate_within_capacities`` does, of components where sources state what they give of each."""
+        rate = self.rate_within_capacities(stock, controls, step, factors)
+        if self.source_contents:
+            self.source_contents.share_out(rate, step, factors)
+        return rate
+
     def _check_finite(self, stock: Floats, inner: Floats) -> None:
         if np.isfinite(stock).all() and np.isfinite(inner).all():
             return
@@ -192,7 +201,7 @@ class Dynamics(FlowLaws):
     ) -> tuple[Floats, Floats]:
         """Return the flows at the start of an episode, cut to what the donors hold, mass/time; see ``of_arcs``."""
         first = np.zeros(stock.shape[1], dtype=np.intp)
-        rate = self.rate_within_capacities(stock, controls, first, factors)
+        rate = self.rate_of_components(stock, controls, first, factors)
         if self.slots is not None:
             stock = self.slots.shift_slots(stock)
             self.slots.set_outflows(stock, rate)

@@ -22,6 +22,7 @@ import numpy as np
 from cirl_marl.dynamics.components import simulated_network
 from cirl_marl.dynamics.routing import Routing
 from cirl_marl.dynamics.shares import Shares
+from cirl_marl.dynamics.source_contents import SourceContents
 from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.dynamics.uncertain_factors import ControlFactors, FlowFactors, IntervalFactors
@@ -226,6 +227,7 @@ class FlowLaws(ArcRates):
         is_fixed: arcs whose r is the same in all copies and intervals, shape (arcs,).
         routing: what passes through nodes that store nothing.
         control_factors: which controls are as they were drawn.
+        source_contents: what sources give whose contents change; not in ``rate``, which is of orders.
     """
 
     def __init__(self, network: Network, *, uncertain: bool = False) -> None:
@@ -243,7 +245,9 @@ class FlowLaws(ArcRates):
         self.incidence = RowSum(ends[has_stock], arcs_twice[has_stock], signs[has_stock], (rows.masses, arcs))
         self.shares = Shares(staged_network, ranges)
         self.max_rate[self.shares.arcs] *= self.shares.highest
+        self.source_contents = SourceContents(network, staged_network, ranges)
         time_arcs = [*self._series_arcs, *(self.shares.varying_arcs if self.shares.is_time_varying else ())]
+        time_arcs += self.source_contents.arcs[0].tolist() if self.source_contents.varies else []
         self.time_dependent = tuple(staged_network.arcs[k].id for k in time_arcs)
         self._share_out()
         self.routing = Routing(staged_network, self.rate(self.neutral[:, :1]), self.is_fixed, ranges)

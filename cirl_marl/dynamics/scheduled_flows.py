@@ -11,9 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from cirl_marl.dynamics.components import ComponentNetwork
+from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.network.compartment_model import Bools
 from cirl_marl.network.rowsum import NEGLIGIBLE, RowSum
 
 KEPT = 1.0 - 1e-12
@@ -76,22 +76,25 @@ class ScheduledFlows:
     """Cuts scheduled flows so that no donor is overdrawn.
 
     A donor with stock x, proportional exits a and a constant outflow U obeys ẋ ≥ −a·x − U, which stays non-negative for
-    a substep h if U ≤ x·a/(e^{ah} − 1). Flows from one donor are cut by the same factor.
+    a substep h if U ≤ x·a/(e^{ah} − 1). Flows from one donor are cut by the same factor, and so are all components of
+    a source whose contents change.
     """
 
-    def __init__(self, network: Network, is_scheduled: Bools, driver: Integers, substep: float) -> None:
+    def __init__(self, laws: FlowLaws, substep: float) -> None:
         """Find the donors of scheduled flows, and their outflows by schedule and in proportion to their stock."""
-        self._substep = substep
+        self._substep, network = substep, laws.staged_network
+        of_sources = set(laws.source_contents.arcs.ravel().tolist())
         components = 1 + len(network.substances) if isinstance(network, ComponentNetwork) else 1
         arcs, stores = len(network.arcs) // components, len(network.stores) // components
         # what comes out of slots is of the component that is in them
         lines = {network.arc_index[arc] for arc in network.lines.values()} if isinstance(network, StagedNetwork) else ()
-        orders = [k for k in np.flatnonzero(is_scheduled).tolist() if k < arcs or k in lines]
+        orders = [k for k in np.flatnonzero(laws.is_scheduled).tolist() if k < arcs or k in lines or k in of_sources]
         self._arcs: Integers = np.array(orders, dtype=np.intp)
         self._donors, place = np.unique(network.donors[self._arcs], return_inverse=True)
         self._slot: Integers = place
         slot = {int(node): i for i, node in enumerate(self._donors)}
-        proportional = driver == network.donors
+        self._together = np.searchsorted(self._donors, laws.source_contents.donors)
+        proportional = laws.driver == network.donors
         exits = [k for k, d in enumerate(network.donors) if int(d) in slot and proportional[k]]
         exit_slot = [len(slot) + slot[int(network.donors[k])] for k in exits]
         rows, columns = [*self._slot, *exit_slot], [*self._arcs, *exits]
@@ -99,7 +102,7 @@ class ScheduledFlows:
         self._sum = RowSum(self._slot, np.arange(len(self._arcs)), 1.0, (len(slot), len(self._arcs)))
         self._loads = None
         if components > 1:
-            orders = [k for k in orders if k not in lines]
+            orders = [k for k in orders if k not in lines and k not in of_sources]
             self._loads = Loads(network, orders, self._donors, arcs, stores, components)
 
     def cut(self, stock: Floats, rate: Floats) -> Floats:
@@ -116,6 +119,7 @@ class ScheduledFlows:
             return rate  # x·a/(e^{ah} − 1) ≥ x(1 − ah)/h: nothing can be overdrawn
         available = available_stock * _deliverable(turned_over) * KEPT
         factor = np.divide(available, demand, out=np.ones_like(available_stock), where=demand > available)
+        factor[self._together] = factor[self._together].min(axis=0)
         rate = rate.copy()
         rate[self._arcs] *= factor.take(self._slot, axis=0)
         return rate
@@ -146,8 +150,13 @@ class ScheduledFlows:
         if not is_cut.any():
             return
         ratio = np.divide(1.0, demand, out=np.zeros_like(demand), where=is_cut)
-        factor_adjoint = self._sum(adjoint[self._arcs] * rate[self._arcs]) * ratio
-        adjoint[self._arcs] *= np.where(is_cut, available * ratio, 1.0).take(self._slot, axis=0)
+        factor, load = np.where(is_cut, available * ratio, 1.0), self._sum(adjoint[self._arcs] * rate[self._arcs])
+        together = factor[self._together]
+        factor[self._together] = together.min(axis=0)
+        is_least = np.arange(len(together))[:, None, None] == together.argmin(axis=0)
+        load[self._together] = np.where(is_least, load[self._together].sum(axis=0), 0.0)
+        factor_adjoint = load * ratio
+        adjoint[self._arcs] *= factor.take(self._slot, axis=0)
         whole_adjoint += factor_adjoint * deliverable * KEPT
         # d/dT of T/(e^T − 1), T what is turned over
         grown = np.expm1(turned_over)

@@ -13,9 +13,9 @@ from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.errors import ControlError, unknown_name
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.compartment_model import DiscreteTimeModel, GoalTask
-from cirl_marl.network.initial_ages import start_shares
 from cirl_marl.network.processes import Paths, disturbance_stream
-from cirl_marl.network.uncertainty import CONTENT, numbers_of
+from cirl_marl.network.substances import CONTENT, changing_sources
+from cirl_marl.network.uncertainty import numbers_of
 
 
 class Starts:
@@ -43,12 +43,13 @@ class Starts:
         ids = {i: network.stores[i].id for i in rows.stages}
         self._stages = {id_: rows.stages[i] for i, id_ in ids.items()}
         self._rows |= self._stages
-        interval = network.episode.control_interval
-        self._spread = {id_: start_shares(network, network.stores[i], interval) for i, id_ in ids.items()}
+        self._spread = {id_: network.start_shares(network.stores[i]) for i, id_ in ids.items()}
         self._components, substances = rows.components, [substance.id for substance in network.substances]
+        reserves = {node.id for node in changing_sources(network)}  # which do for all that may be
         self._uncertain_contents = [
-            (part + 1, numbers_of(network.uncertain, "nodes", f"{CONTENT}{substance}"))
-            for part, substance in enumerate(substances)
+            (part, {id_: row for id_, row in numbers.items() if id_ not in reserves})
+            for part, substance in enumerate(substances, start=1)
+            for numbers in [numbers_of(network.uncertain, "nodes", f"{CONTENT}{substance}")]
         ]
         inseparable = {name for names in self._wholes.values() for name in names}
         self._array_order = () if inseparable & set(order) else tuple(order)

@@ -193,7 +193,7 @@ class FeedbackRule(CheckedRecord):
     ] = ()
 
 
-CONTENT = Quantity("a part of the mass", low=0.0, high=1.0)
+CONTENT = Quantity("a part of the mass", low=0.0, high=1.0, varies=True)
 RATES = Rates(
     "amounts by account, per mass that flows along an arc or enters a node; negative ones are revenues or credits"
 )
@@ -302,7 +302,12 @@ class Node(Compartment):
     holding: Annotated[NamedValues, Rates("amounts by account, per mass that is held and time", per="stock")] = ()
     content: Annotated[
         NamedValues,
-        Rates("part of each substance in the initial stock, and in the history", of="substance", number=CONTENT),
+        Rates(
+            "part of each substance in the initial stock and in the history, in which it may change in time; likewise "
+            "in what a source gives that nothing enters and that schedules alone empty",
+            of="substance",
+            number=CONTENT,
+        ),
     ] = ()
     set_point: Annotated[
         float | None, Quantity("stock aimed at, mass, or throughput, mass/time; None if there is none", of=LEVEL_OF)

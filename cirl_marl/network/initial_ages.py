@@ -10,9 +10,8 @@ import numpy as np
 from cirl_marl.network.elements import Lifetime, Node
 from cirl_marl.network.lifetimes import Chain
 from cirl_marl.network.rowsum import Floats
-from cirl_marl.network.series import Series
+from cirl_marl.network.series import Series, Value, means
 from cirl_marl.network.specification import Specification
-from cirl_marl.network.substances import contents
 
 STEEPEST = 100.0
 """Most by which the logarithm of what enters may grow in a lifetime."""
@@ -23,19 +22,20 @@ def slots(lifetime: Lifetime, interval: float) -> int:
     return round(lifetime.mean / interval)
 
 
-def remaining_history(node: Node, interval: float) -> Floats:
+def remaining_history(node: Node, interval: float, content: Value = 1.0) -> Floats:
     """Return what is left of a node's history at the start of the episode, by stage or slot, mass.
 
     What enters is spread evenly over each interval before the start. Before the history it had grown by e^(g·t), so
     that the mean of an interval of length h before its first value is e^(−gh) of that, or it was nothing if the node
     states no ``growth``. Stages begin with the one with most to go, slots with the youngest; after them is what comes
-    out, of which there is none between intervals.
+    out, of which there is none between intervals. With a ``content`` it is that of a substance, which before the
+    history had its first content.
     """
     lifetime, history, growth = node.lifetime, node.history, node.growth
     assert lifetime is not None and history is not None
     if lifetime.chain is None:
-        return np.append(past_inflows(node, interval, slots(lifetime, interval)), 0.0)
-    return _remaining_stages(lifetime.chain, earlier_lifetime(node), history, growth, interval)
+        return np.append(past_inflows(node, interval, slots(lifetime, interval), content), 0.0)
+    return _remaining_stages(lifetime.chain, earlier_lifetime(node), history, growth, interval, content)
 
 
 def earlier_lifetime(node: Node) -> float:
@@ -45,18 +45,32 @@ def earlier_lifetime(node: Node) -> float:
 
 
 @lru_cache(maxsize=1024)  # a network asks several times, and its scenarios do
-def _remaining_stages(chain: Chain, mean: float, history: Series, growth: float | None, interval: float) -> Floats:
-    edges = np.append(np.arange(history.times[0], -1e-9 * interval, interval), 0.0)
+def _remaining_stages(
+    chain: Chain, mean: float, history: Series, growth: float | None, interval: float, content: Value
+) -> Floats:
+    edges = _past_edges(history, interval)
     stages = np.zeros(chain.stages)
     if growth is not None:
         stages = chain.growing_stock(growth * mean) * _first(history, growth, interval) * mean
+        stages *= means(content, edges[:2])
     whole = propagator(chain, interval / mean)
-    for begin, end, inflow in zip(edges[:-1], edges[1:], history.means(edges), strict=True):
+    inflows = history.means(edges) * means(content, edges)
+    for begin, end, inflow in zip(edges[:-1], edges[1:], inflows, strict=True):
         shorter = end - begin < interval * (1 - 1e-9)
         transition, gain = propagator(chain, (end - begin) / mean) if shorter else whole
         stages = transition @ stages + gain * inflow * mean
     stages.flags.writeable = False
     return stages
+
+
+def _past_edges(history: Series, interval: float) -> Floats:
+    return np.append(np.arange(history.times[0], -1e-9 * interval, interval), 0.0)
+
+
+def content_edges(network: Specification, node: Node) -> Floats:
+    """Return the times between which contents of a node are stated: intervals of the episode, or of its history."""
+    interval, horizon = network.episode.control_interval, network.episode.horizon
+    return _past_edges(node.history, interval) if node.history is not None else np.arange(horizon + 1.0) * interval
 
 
 def age_shares(node: Node, interval: float) -> Floats:
@@ -73,12 +87,6 @@ def age_shares(node: Node, interval: float) -> Floats:
     else:
         parts = np.append(np.exp(-growth * interval * np.arange(slots(lifetime, interval))), 0.0)
     return np.asarray(parts / parts.sum())
-
-
-def start_shares(network: Specification, node: Node, interval: float) -> Floats:
-    """Return the part of a node's initial stock that is in each of its rows: by component, and in each by age."""
-    ages = np.ones(1) if node.lifetime is None else age_shares(node, interval)
-    return np.asarray(np.kron(contents(network, node), ages)) if network.substances else ages
 
 
 @lru_cache(maxsize=256)  # commodities and scenarios share lifetimes, and a matrix exponential takes milliseconds
@@ -98,15 +106,16 @@ def propagator(chain: Chain, time: float) -> tuple[Floats, Floats]:
     return exponential[:size, :size], exponential[:size, size]
 
 
-def past_inflows(node: Node, interval: float, count: int) -> Floats:
+def past_inflows(node: Node, interval: float, count: int, content: Value = 1.0) -> Floats:
     """Return the mass that entered in each of some intervals before the start, last first, shape (count,).
 
-    Without a history it is relative to that of the last one.
+    Without a history it is relative to that of the last one; with one, a ``content`` makes it that of a substance.
     """
     if node.history is None:
         return np.asarray(np.exp(-(node.growth or 0.0) * interval * np.arange(count)))
     first = _first(node.history, node.growth, interval)
-    return np.array([_between(node, first, -interval * (i + 1), -interval * i) for i in range(count)])
+    times = [(-interval * (i + 1), -interval * i) for i in range(count)]
+    return np.array([_between(node, first, *ends) * _past_content(node, interval, content, *ends) for ends in times])
 
 
 def _first(history: Series, growth: float | None, interval: float) -> float:
@@ -128,6 +137,14 @@ def _between(node: Node, first: float, begin: float, end: float) -> float:
         past, g = (begin - start, until - start), node.growth
         mass += first * (past[1] - past[0] if g == 0 else float(np.exp(g * past[1]) - np.exp(g * past[0])) / g)
     return mass
+
+
+def _past_content(node: Node, interval: float, content: Value, begin: float, end: float) -> float:
+    """Return the mean content of what entered between two times before the start; before the history its first."""
+    assert node.history is not None
+    start = node.history.times[0]
+    until = end if end > start else min(start + interval, 0.0)
+    return float(means(content, np.array([max(begin, start), until]))[0])
 
 
 def age_problems(node: Node, interval: float) -> Iterator[str]:

@@ -25,12 +25,13 @@ from scipy import sparse
 from cirl_marl.errors import CirlError, NetworkError, unknown_name
 from cirl_marl.network.declarations import declarations
 from cirl_marl.network.elements import SINKS, Arc, Compartment, ControlKind, Law, Node, Role, Service
-from cirl_marl.network.initial_ages import remaining_history
+from cirl_marl.network.initial_ages import age_shares, remaining_history
 from cirl_marl.network.processes import DisturbanceProcesses
 from cirl_marl.network.rowsum import Floats, Integers, RowSum, spans
 from cirl_marl.network.series import Series
 from cirl_marl.network.specification import Specification
 from cirl_marl.network.split_fractions import Split, splits
+from cirl_marl.network.substances import CONTENT, changes, changing_sources, contents
 from cirl_marl.network.uncertainty import CAPACITY, CERTAIN, factor_ranges
 from cirl_marl.network.validation import problems
 
@@ -134,8 +135,8 @@ class Network(Specification):
     def initial(self) -> Floats:
         """Lowest and highest stock at the start, shape (2, stores), mass.
 
-        A source without a known reserve starts with the most that its scheduled outflows can ask for in an episode, a
-        node with a history with what is left of it.
+        A source without a known reserve starts with the most that its scheduled outflows can ask for in an episode, of
+        each substance if its contents change, a node with a history with what is left of it.
         """
         bounds = [node.initial or (0.0, 0.0) for node in self.stores]
         initial = np.array(bounds, dtype=float).reshape(-1, 2).T.copy()
@@ -143,23 +144,63 @@ class Network(Specification):
             if node.initial is None and node.history is not None:
                 initial[:, i] = remaining_history(node, self.episode.control_interval).sum()
         without_start = {node.id for node in self.stores if node.initial is None and node.history is None}
-        ranges = factor_ranges(self, with_draws=True)
+        reserves = {node.id: self._reserve(node).sum() for node in changing_sources(self)}
         for arc in self.arcs:
-            if arc.donor in without_start:
-                donor = self.nodes[self.node_index[arc.donor]]
-                base = self.interval_means(arc.flow) * ranges.get(f"arcs.{arc.id}.flow", CERTAIN)[1]
-                base = np.ones_like(base) if arc.law is Law.CONTROLLED else base
-                # a valve on the donor scales all its outflows, a control that sets a flow is of the controlled one
-                sets = [(f"arcs.{arc.id}", arc.control), (f"nodes.{donor.id}", donor.control)]
-                factors = [
-                    self.interval_means(control.high)
-                    * math.prod(ranges.get(f"{path}.{name}", CERTAIN)[1] for name in ("control", CAPACITY))
-                    for path, control in sets
-                    if control is not None and (control.kind is ControlKind.RATE or arc.law is Law.CONTROLLED)
-                ]
-                demand = np.prod([base, *factors], axis=0).sum() * self.episode.control_interval
+            if arc.donor in without_start and arc.donor not in reserves:
+                demand = self._demand(arc).sum() * self.episode.control_interval
                 initial[:, self.node_index[arc.donor]] += demand * (1 + RESERVE)
+        for id_ in without_start & reserves.keys():
+            initial[:, self.node_index[id_]] = reserves[id_]
         return _read_only(initial)
+
+    @cached_property
+    def _factor_ranges(self) -> Mapping[str, tuple[float, float]]:
+        return factor_ranges(self, with_draws=True)
+
+    def _demand(self, arc: Arc) -> Floats:
+        """Return the most that can be asked of a scheduled arc in each interval, shape (horizon,), mass/time."""
+        ranges, donor = self._factor_ranges, self.nodes[self.node_index[arc.donor]]
+        base = self.interval_means(arc.flow) * ranges.get(f"arcs.{arc.id}.flow", CERTAIN)[1]
+        base = np.ones_like(base) if arc.law is Law.CONTROLLED else base
+        # a valve on the donor scales all its outflows, a control that sets a flow is of the controlled one
+        sets = [(f"arcs.{arc.id}", arc.control), (f"nodes.{donor.id}", donor.control)]
+        factors = [
+            self.interval_means(control.high)
+            * math.prod(ranges.get(f"{path}.{name}", CERTAIN)[1] for name in ("control", CAPACITY))
+            for path, control in sets
+            if control is not None and (control.kind is ControlKind.RATE or arc.law is Law.CONTROLLED)
+        ]
+        return np.asarray(np.prod([base, *factors], axis=0))
+
+    def _reserve(self, source: Node) -> Floats:
+        """Return the most that can be asked of each component of a changing source, shape (components,), mass."""
+        parts = contents(self, source, self.interval_means)
+        for row, substance in enumerate(self.substances, start=1):
+            low, high = self._factor_ranges.get(f"nodes.{source.id}.{CONTENT}{substance.id}", CERTAIN)
+            parts[0] += (1.0 - low) * parts[row]
+            parts[row] *= high
+        demand = sum((self._demand(arc) for arc in self.arcs if arc.donor == source.id), np.zeros(parts.shape[1]))
+        return np.asarray(parts @ demand * self.episode.control_interval * (1 + RESERVE))
+
+    def start_shares(self, node: Node) -> Floats:
+        """Return the part of a node's initial stock that is in each of its rows: by component, and in each by age.
+
+        Of a changing source the components are as what can be asked of each at most.
+        """
+        interval = self.episode.control_interval
+        ages = np.ones(1) if node.lifetime is None else age_shares(node, interval)
+        if not self.substances:
+            return ages
+        if node.history is not None and changes(node):
+            content = dict(node.content)
+            masses = [remaining_history(node, interval, content.get(part.id, 0.0)) for part in self.substances]
+            whole = remaining_history(node, interval)
+            return np.asarray(np.concatenate([np.maximum(whole - sum(masses), 0.0), *masses]) / whole.sum())
+        if node.id in (source.id for source in changing_sources(self)):
+            reserve = self._reserve(node)
+            parts = reserve if reserve.any() else contents(self, node, self.interval_means)[:, 0]
+            return np.asarray(parts / parts.sum())
+        return np.asarray(np.kron(contents(self, node, lambda content: np.array([content]))[:, 0], ages))
 
     @cached_property
     def node_index(self) -> Mapping[str, int]:
@@ -223,7 +264,12 @@ class Network(Specification):
     def time_dependent(self) -> tuple[str, ...]:
         """Compartments of which a number, or a bound of the control, changes in time."""
         parts = [(c.id, part) for c in self.compartments.values() for part in (c, c.control) if part is not None]
-        ids = (i for i, p in parts if any(isinstance(getattr(p, name), Series) for name in declarations(type(p))))
+        ids = (
+            id_
+            for id_, part in parts
+            if any(isinstance(getattr(part, name), Series) for name in declarations(type(part)))
+            or (isinstance(part, Node) and changes(part))
+        )
         return tuple(dict.fromkeys(ids))
 
     @cached_property

@@ -177,11 +177,19 @@ Value = float | Series
 """What may change in time."""
 
 
+def series_of(values: Floats, interval: float) -> Series:
+    """Return the series that has these values in control intervals of some length."""
+    return Series(times=tuple((interval * np.arange(len(values))).tolist()), values=tuple(values.tolist()))
+
+
 def in_intervals(values: Floats, interval: float) -> Value:
     """Return what has these values in control intervals of some length; a number if they are all the same."""
-    if (values == values[0]).all():
-        return float(values[0])
-    return Series(times=tuple((interval * np.arange(len(values))).tolist()), values=tuple(values.tolist()))
+    return float(values[0]) if (values == values[0]).all() else series_of(values, interval)
+
+
+def means(value: Value, edges: Floats) -> Floats:
+    """Return the mean of a value over each interval between ``edges``, shape (len(edges) − 1,)."""
+    return value.means(edges) if isinstance(value, Series) else np.full(len(edges) - 1, float(value))
 
 
 def extremes(value: Value) -> tuple[float, float]:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from cirl_marl.network.elements import Arc, ControlKind, Law, Node
+from cirl_marl.network.rowsum import Floats
+from cirl_marl.network.series import Series, Value
 from cirl_marl.network.specification import Specification
 from cirl_marl.network.split_fractions import Split, splits, trap_problems
 
 REMAINDER = "remainder"
 """What that of a stock is called which is no substance."""
+CONTENT = "content."
+"""What names of numbers that are contents begin with, before the substance."""
 
 
 def arc_of_substance(arc: Arc, substance: str) -> Arc:
@@ -48,16 +54,45 @@ def separates(network: Specification, split: Split) -> bool:
 
 
 def follows_contents(network: Specification) -> bool:
-    """Whether masses or services depend on contents: where a node separates, or a service demands one."""
-    return any(service.substance for service in network.services) or bool(separated_substances(network))
+    """Whether masses or services depend on contents: by a node that separates, a service, or a changing source."""
+    if any(service.substance for service in network.services):
+        return True
+    return bool(separated_substances(network) or changing_sources(network))
 
 
-def contents(network: Specification, node: Node) -> list[float]:
-    """Return the parts of a node's initial stock: what is no substance, then each substance; they sum to 1."""
+def is_past(part: Any, name: str) -> bool:
+    """Whether a number of a part is the content of a history, so that it is about the time before the episode."""
+    return name.startswith(CONTENT) and part.history is not None
+
+
+def changes(node: Node) -> bool:
+    """Whether some content of a node changes in time."""
+    return any(isinstance(part, Series) for part in dict(node.content).values())
+
+
+def changing_sources(network: Specification) -> list[Node]:
+    """Return the sources whose contents change in time, or are disturbed, in the order of the nodes.
+
+    What they give has the content of the interval. Of their stock each component is a reserve of its own: they hold
+    what can be asked of each at most, and give out when one of them does.
+    """
+    ids = {path.split(".")[1] for path in network.disturbed if f".{CONTENT}" in path}
+    return [
+        node
+        for node in network.nodes
+        if node.history is None and (node.id in ids or changes(node)) and network.original(node.id) == node.id
+    ]
+
+
+def contents(network: Specification, node: Node, values: Callable[[Value], Floats]) -> Floats:
+    """Return the parts of a node's mass: what is no substance, then each substance, shape (components, times).
+
+    They sum to 1. ``values`` says what a number is at some times.
+    """
     content: dict[str, Any] = dict(node.content)
-    parts = [float(content.get(substance.id, 0.0)) for substance in network.substances]
-    whole = max(sum(parts), 1.0)  # of sums of decimals, which round
-    return [max(1.0 - sum(parts), 0.0), *(part / whole for part in parts)]
+    parts = np.array([values(content.get(substance.id, 0.0)) for substance in network.substances])
+    whole = np.maximum(parts.sum(axis=0), 1.0)  # of sums of decimals, which round
+    return np.concatenate([np.maximum(1.0 - parts.sum(axis=0, keepdims=True), 0.0), parts / whole])
 
 
 def separation_problems(network: Specification) -> Iterator[str]:

@@ -23,10 +23,17 @@ from cirl_marl.network.declarations import (
 )
 from cirl_marl.network.elements import FIXED_LIFETIME, Arc, Compartment, Control, ControlKind, Law, Node, Service
 from cirl_marl.network.rowsum import Floats, Integers, single_column
-from cirl_marl.network.series import Series, Value, extremes, in_intervals
+from cirl_marl.network.series import Series, Value, extremes, in_intervals, series_of
 from cirl_marl.network.specification import Specification
 from cirl_marl.network.split_fractions import ROUNDING, Split, proportions, splits, trap_problems
-from cirl_marl.network.substances import arc_of_substance, network_of_substance, separated_substances, separates
+from cirl_marl.network.substances import (
+    CONTENT,
+    arc_of_substance,
+    is_past,
+    network_of_substance,
+    separated_substances,
+    separates,
+)
 
 WIDE = 4.0
 """Deviations of a normal distribution up to which every distribution goes that states no range, by probability."""
@@ -35,8 +42,6 @@ CERTAIN = (1.0, 1.0)
 """Range of the factor on a number that is certain."""
 KINDS: Mapping[str, type[Any]] = {"nodes": Node, "arcs": Arc, "services": Service}
 """Parts of a network whose numbers may be uncertain, by the key of their table."""
-CONTENT = "content."
-"""What paths of contents of initial stocks go on with, before the substance; they are drawn and not disturbed."""
 CAPACITY = "control.high"
 """What a disturbance may lower, or raise, of an actuator, as the last part of a path: its upper bound."""
 
@@ -222,13 +227,15 @@ def _undrawable(network: Specification, part: Any, name: str, path: str) -> Iter
 
 
 def _no_content(network: Specification, node: Node, path: str) -> str:
-    """Return why the content of an initial stock cannot be drawn, or nothing."""
-    if path in network.disturbed:
+    """Return why the contents of a node cannot be drawn or disturbed, or nothing."""
+    if path in network.disturbed and is_past(node, CONTENT):
         return "what is in a stock at the start cannot be disturbed in time, but drawn"
-    most = sum(
-        extremes(part)[1] * _factor_range(network, f"nodes.{node.id}.{CONTENT}{id_}")[1]
+    parts = [
+        (np.array(extremes(part)[1]) if is_past(node, CONTENT) else network.interval_means(part))
+        * _factor_range(network, f"nodes.{node.id}.{CONTENT}{id_}")[1]
         for id_, part in dict(node.content).items()
-    )
+    ]
+    most = float(np.max(sum(parts)))
     return f"some draws of its contents sum to {most:.4g}, more than 1; give ranges" if most > 1 + ROUNDING else ""
 
 
@@ -300,8 +307,7 @@ def draw_network(network: Any, factors: Sequence[float] = (), path: Floats | Non
         course = path[: len(stated), network.processes.names.index(disturbed.by)]
         value = stated * drawn.get(number, 1.0)
         course = value + disturbed.scale * course if disturbed.adds else value * course
-        # what stands still throughout is no number that somebody forgot
-        change(part, name, in_intervals(course, interval) or Series(times=(0.0,), values=(0.0,)))
+        change(part, name, _course(name, course, interval))
 
     def drawn_arc(k: int) -> Any:
         arc = network.arcs[k]
@@ -366,9 +372,8 @@ def network_of_intervals(network: Any, intervals: Integers) -> Any:
     def part_of_intervals(part: Any) -> Any:
         series: dict[str, Any] = {}
         for name, declaration, value in numbers(part):
-            if isinstance(value, Series) and not getattr(declaration, "past", False):
-                means = network.interval_means(value)[intervals]
-                chosen = in_intervals(means, length) or Series(times=(0.0,), values=(0.0,))
+            if isinstance(value, Series) and not (getattr(declaration, "past", False) or is_past(part, name)):
+                chosen = _course(name, network.interval_means(value)[intervals], length)
                 series = with_number(part, name, chosen, series)
         if getattr(part, "control", None) is not None:
             series["control"] = part_of_intervals(part.control)
@@ -376,6 +381,15 @@ def network_of_intervals(network: Any, intervals: Integers) -> Any:
 
     groups = {key: tuple(map(part_of_intervals, getattr(network, key))) for key in KINDS}
     return replace(network, **groups, episode=replace(network.episode, horizon=len(intervals)), scenarios={})
+
+
+def _course(name: str, values: Floats, interval: float) -> Value:
+    """Return the number ``name`` that has these values: a series of what stands still, which nobody forgot, too.
+
+    So are contents, as a source whose contents change has reserves of them.
+    """
+    value = in_intervals(values, interval)
+    return series_of(values, interval) if value == 0.0 or name.startswith(CONTENT) else value
 
 
 def _times(network: Specification, value: Value, factor: float, most: float = math.inf) -> Value:
@@ -436,8 +450,7 @@ def _uncertain_field(network: Specification, path: str) -> tuple[Any, str]:
     options = [
         field
         for field, declaration, _ in numbers(parts[id_])
-        if isinstance(declaration, Quantity)
-        and (field.startswith(CONTENT) or (declaration.varies and not declaration.past))
+        if isinstance(declaration, Quantity) and declaration.varies and not declaration.past
     ]
     if isinstance(parts[id_], Compartment):
         options += ["control", CAPACITY]

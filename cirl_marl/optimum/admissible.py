@@ -19,7 +19,7 @@ from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import positional_record, with_field_docs
 from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Node
 from cirl_marl.network.split_fractions import Split
-from cirl_marl.optimum.content_ranges import Mixtures, content_ranges
+from cirl_marl.optimum.content_ranges import Mixtures, content_ranges, source_grades
 from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.vintages import Lifetimes
 
@@ -288,17 +288,19 @@ def _mixtures(lifetimes: Lifetimes, setting: Floats, valve: Floats, base: Floats
     arcs = np.array([[plan_network.arc_index[id_] for id_ in plan_network.components_of(k.id)] for k in whole_arcs])
     arcs = arcs.astype(np.intp).reshape(-1, 1 + len(network.substances)).T
     if like is not None:
-        content, stocks = like.content, like.stocks
+        content, stocks, grade = like.content, like.stocks, like.grade
     else:
         shares, by_share = np.ones((2, *arcs.shape)), [arc.law is Law.SHARE for arc in whole_arcs]
         shares[0][:, by_share] = setting[0].min(axis=0)[arcs[:, by_share]]
         shares[1][:, by_share] = setting[2].max(axis=0)[arcs[:, by_share]]
-        content, stocks = content_ranges(network, shares)
+        (content, stocks), grade = content_ranges(network, shares), source_grades(network, network.arcs)
     scheduled = np.flatnonzero([LAWS[arc.law].is_scheduled for arc in whole_arcs])
     orders = (setting * valve[:, :, plan_network.donors] * base)[::2][:, :, arcs[0, scheduled]]
-    for (low, high), of_component in zip(content.transpose(1, 0, 2)[:, :, scheduled], arcs[:, scheduled], strict=True):
-        setting[:, :, of_component] *= np.stack([low, (low + high) / 2, high])[:, None]
-    return Mixtures(arcs, content, stocks, scheduled, orders)
+    parts = content.transpose(1, 0, 2)[:, :, scheduled]
+    for (low, high), of_component, part in zip(parts, arcs[:, scheduled], grade[..., scheduled], strict=True):
+        ranges = np.stack([low, (low + high) / 2, high])[:, None]
+        setting[:, :, of_component] *= np.where(np.isnan(part), ranges, part)
+    return Mixtures(arcs, content, grade, stocks, scheduled, orders)
 
 
 def _sets_transfer(arc: Arc) -> bool:

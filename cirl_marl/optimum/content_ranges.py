@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
 from typing import Annotated
 
 import numpy as np
@@ -11,7 +13,10 @@ from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import positional_record
-from cirl_marl.network.substances import contents, separates
+from cirl_marl.network.elements import Arc
+from cirl_marl.network.initial_ages import content_edges
+from cirl_marl.network.series import means
+from cirl_marl.network.substances import changing_sources, contents, separates
 
 ROUND_OFF = 1e-9
 """Part of all stocks that one of them may have too much or too little of a component, as simulators round."""
@@ -25,6 +30,7 @@ class Mixtures:
 
     arcs: Annotated[Integers, "of the planned network, shape (components, arcs)"]
     content: Annotated[Floats, "least and greatest part of each component, shape (2, components, arcs)"]
+    grade: Annotated[Floats, "part that changing sources give, else NaN, shape (components, steps, arcs)"]
     stocks: Annotated[Floats, "likewise of the stocks, shape (2, components, stores)"]
     scheduled: Annotated[Integers, "which of the arcs flow by schedule"]
     orders: Annotated[Floats, "least and most asked of the whole of these, shape (2, steps, scheduled), mass/time"]
@@ -34,12 +40,23 @@ class Mixtures:
         """Whether the content of each flow may change, shape (arcs,)."""
         return np.asarray((self.content[0] < self.content[1]).any(axis=0))
 
+    @property
+    def has_grade(self) -> NDArray[np.bool_]:
+        """Whether each flow has a content that is known for each interval, as a changing source gives it, (arcs,)."""
+        return np.asarray(~np.isnan(self.grade[0, 0]))
+
+    def parts(self, arc: int, period: slice) -> Floats:
+        """Return the least and greatest part of each component in a flow, (2, components, steps of the period or 1)."""
+        grade = self.grade[:, period, arc]
+        return np.stack([grade, grade]) if self.has_grade[arc] else self.content[:, :, arc, None]
+
 
 def content_ranges(network: Network, shares: Floats) -> tuple[Floats, Floats]:
     """Return what part of each flow, and of each stock, each component may be at any time, whatever agents do.
 
     Stocks begin with their content and mix what enters; what a node hands on in shares that differ by component has
-    s_c·x_c of Σ s·x. The ranges are the least that contain the start and reproduce themselves.
+    s_c·x_c of Σ s·x. The ranges are the least that contain the start, or all that a history or a changing source had,
+    and reproduce themselves. Nothing is said of the stocks of changing sources.
 
     Args:
         network: whose nodes have the contents.
@@ -55,7 +72,8 @@ def content_ranges(network: Network, shares: Floats) -> tuple[Floats, Floats]:
         is_separate[[*split.controlled_arcs, *split.other_arcs]] = separates(network, split)
     ranges = np.tile([[[1.0]], [[0.0]]], (1, 1 + len(network.substances), len(network.nodes)))
     for i, node in enumerate(network.stores):
-        ranges[:, :, i] = contents(network, node)
+        parts = contents(network, node, partial(means, edges=content_edges(network, node)))
+        ranges[:, :, i] = parts.min(axis=1), parts.max(axis=1)
     for done in range(ROUNDS + len(network.nodes)):
         flows = _handed_on(ranges[:, :, network.donors], shares, is_separate)
         wider = ranges.copy()
@@ -70,7 +88,18 @@ def content_ranges(network: Network, shares: Floats) -> tuple[Floats, Floats]:
     changes = ranges[0] != ranges[1]
     margin = np.array([-1e-9, 1e-9])[:, None, None] * changes  # of rounding, and what was too little to have settled
     ranges = (ranges + margin).clip(0.0, 1.0)
-    return _handed_on(ranges[:, :, network.donors], shares, is_separate), ranges[:, :, : len(network.stores)]
+    stocks = ranges[:, :, : len(network.stores)].copy()
+    stocks[..., [network.node_index[source.id] for source in changing_sources(network)]] = [[[0.0]], [[1.0]]]
+    return _handed_on(ranges[:, :, network.donors], shares, is_separate), stocks
+
+
+def source_grades(network: Network, arcs: Sequence[Arc]) -> Floats:
+    """Return the part of each component that arcs get of changing sources, else NaN, (components, steps, arcs)."""
+    grade = np.full((1 + len(network.substances), network.episode.horizon, len(arcs)), np.nan)
+    for source in changing_sources(network):
+        parts = contents(network, source, network.interval_means)
+        grade[:, :, [arc.donor == source.id for arc in arcs]] = parts[..., None]
+    return grade
 
 
 def check_contents(network: Network, mixtures: Mixtures, rows: StateLayout, initial: Floats) -> None:

@@ -12,7 +12,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.innovations import innovations
-from cirl_marl.network.uncertainty import CONTENT
+from cirl_marl.network.substances import CONTENT
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.aims import NO_AIMS, Aims, account_rows
 from cirl_marl.optimum.certificate import Certificate, verify

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import Service
@@ -36,13 +37,13 @@ def mixture_rows(admissible: Admissible, reach: Reach, intervals: range, rows: P
     several = (mixtures.content[1] > 0).sum(axis=0) > 1
     is_free = (rate[0] < rate[1]).any(axis=0)[mixtures.arcs].any(axis=0)
     for k in np.flatnonzero(several & is_free).tolist():
-        arcs, (low, high) = mixtures.arcs[:, k], mixtures.content[:, :, k]
+        arcs, (low, high) = mixtures.arcs[:, k], mixtures.parts(k, period)
         for component, arc in enumerate(arcs.tolist()):
             for side, sign, part in ((0, 1.0, high[component]), (1, -1.0, low[component])):
-                if NEGLIGIBLE < part < 1.0 - NEGLIGIBLE:
-                    row = rows.add(3, 0, k, t, moments, 2 * component + side)
-                    rows.put(row, starts + arc, sign)
-                    _put_whole(rows, row, starts, arcs, -sign * part)
+                within = np.broadcast_to((NEGLIGIBLE < part) & (part < 1.0 - NEGLIGIBLE), len(t))
+                row = rows.add(3, 0, k, t[within], moments, 2 * component + side)
+                rows.put(row, starts[within] + arc, sign)
+                _put_whole(rows, row, starts[within], arcs, -sign * np.broadcast_to(part, len(t))[within, None])
     for place, k in enumerate(mixtures.scheduled.tolist()):
         if not (several[k] and is_free[k]):
             continue
@@ -54,7 +55,7 @@ def mixture_rows(admissible: Admissible, reach: Reach, intervals: range, rows: P
             rows.limit(row, limit[:, None])
 
 
-def _put_whole(rows: ProgramRows, row: Integers, starts: Integers, arcs: Integers, value: float) -> None:
+def _put_whole(rows: ProgramRows, row: Integers, starts: Integers, arcs: Integers, value: ArrayLike) -> None:
     for arc in arcs.tolist():
         rows.put(row, starts + arc, value)
 

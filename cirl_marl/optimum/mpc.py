@@ -32,6 +32,7 @@ from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import CIRCULARITY, is_of_circularity
 from cirl_marl.network.innovations import innovations
+from cirl_marl.network.substances import CONTENT
 from cirl_marl.network.uncertainty import expected_network
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.aims import Aim, Aims, aims_of
@@ -195,10 +196,11 @@ class MPC(Planner):
 
         Raises:
             NoCertificate: for a network whose flows are not linear laws; see ``bound``.
-            CirlError: for another number of demanded levels than services, or services of contents, which programs of
-                windows do not follow.
+            CirlError: for another number of demanded levels than services, or services or disturbances of contents,
+                which programs of windows do not follow.
         """
-        if contents := [service.id for service in env.network.services if service.substance]:
+        contents = [service.id for service in env.network.services if service.substance]
+        if contents := contents or [path for path in env.network.disturbed if f".{CONTENT}" in path]:
             fault = f"MPC plans masses, not contents, of which {', '.join(contents)} are"
             raise CirlError(f"network '{env.network.name}': {fault}; take 'optimum' or a learner")
         network, (horizon, replan, futures) = env.network, self._options

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.errors import CirlError, unknown_name, whole_number
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.initial_ages import start_shares
 from cirl_marl.network.series import Series, Value
 from cirl_marl.optimum.vintages import Lifetimes
 
@@ -73,7 +72,7 @@ def by_stage(network: Network, state_layout: StateLayout, stocks: ArrayLike) -> 
     staged_masses[..., : masses.shape[-1]] = masses
     if masses.shape[-1] != rows:
         for i, stages in state_layout.stages.items():
-            shares = start_shares(network, network.stores[i], network.episode.control_interval)
+            shares = network.start_shares(network.stores[i])
             staged_masses[..., stages] = masses[..., i, None] * shares
     wrong = np.argwhere(~((staged_masses >= 0) & (staged_masses < math.inf)))
     if len(wrong):

@@ -213,7 +213,7 @@ class Programs:
         reach, lifetime_flow = possible_range(lifetimes, self.system, initial, intervals)
         changes, mixtures = ~reach.uncut, admissible.mixtures
         if mixtures is not None:
-            changes[:, mixtures.arcs[:, mixtures.varies].ravel()] = True  # a content, as if they were cut
+            changes[:, mixtures.arcs[:, mixtures.varies & ~mixtures.has_grade].ravel()] = True  # as if they were cut
         cut = np.where(admissible.by_schedule & changes, admissible.rate[1, period], 0.0)
         start, kinds = lifetimes.start_planned @ initial, admissible.kinds[period]
         equal, equal_to = self._equal.over(kinds, start, cut)

@@ -207,6 +207,10 @@ class ComparisonSystem:
         mass = float(initial.sum()) * (1 + ROUNDING)
         lower, upper = initial.copy(), initial.copy()
         highest, inflow = np.zeros((steps, nodes)), np.zeros((steps, stores))
+        # components of changing sources are cut as the shortest of them
+        mixtures, together = self.admissible.mixtures, np.empty((1, 0), dtype=np.intp)
+        if mixtures is not None:
+            together = mixtures.arcs[:, mixtures.has_grade]
         delivered, chord = np.ones((steps, len(network.arcs))), np.full((steps, len(network.arcs)), np.inf)
         for step, interval in enumerate(intervals):
             least, most = np.where(schedules, self.admissible.rate[:, interval], 0.0)
@@ -234,6 +238,7 @@ class ComparisonSystem:
                 # nodes that store nothing have no entry of their own: what they pass on is never cut
                 part = np.divide(available, asked, out=np.ones(stores), where=~enough)
                 part = np.append(part, 1.0)[np.minimum(network.donors, stores)]
+                part[together] = part[together].min(axis=0)
                 delivered[step] = np.minimum(delivered[step], part)
                 # what is delivered is concave in the stock x, min(1, x·share/asked), so it lies above its chord from 0
                 least_part = np.minimum(
@@ -242,7 +247,9 @@ class ComparisonSystem:
                 slope = np.divide(
                     least_part * (1 - ROUNDING), upper, out=np.zeros(stores), where=upper > ROUNDING * mass
                 )
-                chord[step] = np.minimum(chord[step], np.append(slope, 0.0)[np.minimum(network.donors, stores)])
+                slope = np.append(slope, 0.0)[np.minimum(network.donors, stores)]
+                slope[together] *= part[together] >= 1.0  # others may be short earlier
+                chord[step] = np.minimum(chord[step], slope)
                 least_in, least_out = self._by_node(least * part)
                 constant = np.concatenate([linear.routes.least(least_in) - outflow, stock_inflow - least_out])
                 bounds, error = linear.solution(np.concatenate([lower, upper]), constant)

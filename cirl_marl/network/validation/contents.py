@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+
+import numpy as np
 
 from cirl_marl.errors import unknown_name
 from cirl_marl.network.declarations import bound_problems
 from cirl_marl.network.elements import Arc, ControlKind, Law, Node
+from cirl_marl.network.initial_ages import content_edges
+from cirl_marl.network.series import Series, extremes, means
 from cirl_marl.network.specification import Specification
 from cirl_marl.network.split_fractions import SUMS
-from cirl_marl.network.substances import REMAINDER
+from cirl_marl.network.substances import REMAINDER, changing_sources
 from cirl_marl.network.validation.settings import repetitions
 
 
@@ -23,29 +26,46 @@ def substance_problems(network: Specification) -> Iterator[str]:
         yield from bound_problems(substance, f"substance '{substance.id}': ")
     for node in network.nodes:
         if node.content:
-            yield from _content_problems(node, substances)
+            yield from _content_problems(network, node, substances)
     for arc in network.arcs:
         yield from _transfer_problems(arc, substances)
     yield from _service_problems(network, substances)
     if substances:
         yield from _motion_problems(network)
-        sources = {id_ for node in network.nodes for id_, part in dict(node.content).items() if part}
+        sources = {id_ for node in network.nodes for id_, part in dict(node.content).items() if extremes(part)[1]}
         for id_ in substances:
             if id_ not in sources:
                 yield f"substance '{id_}': no node has any of it; give the content of stocks, such as that of a source"
 
 
-def _content_problems(node: Node, substances: list[str]) -> Iterator[str]:
+def _content_problems(network: Specification, node: Node, substances: list[str]) -> Iterator[str]:
     subject = f"node '{node.id}': content"
     for id_ in dict(node.content):
         if id_ not in substances:
             yield f"{subject}: {unknown_name('substance', id_, substances)}"
     if not node.stores:
         yield f"{subject}: it stores nothing, and what it hands on has the content of what enters it"
-    parts: Any = dict(node.content).values()
-    total = sum(parts)
+    series = [part for part in dict(node.content).values() if isinstance(part, Series)]
+    edges = content_edges(network, node)
+    total = float(np.max(sum(means(part, edges) for part in dict(node.content).values())))
     if total > 1 + SUMS:
         yield f"{subject}: its substances sum to {total:g} of its mass, more than 1"
+    if node.history is not None:
+        late = [part for part in series if part.times[0] > node.history.times[0]]
+        if late:
+            yield f"{subject}: series begins at {late[0].times[0]:g}, after the history at {node.history.times[0]:g}"
+    elif node.stores and node.id in (source.id for source in changing_sources(network)):
+        yield from _source_problems(network, node, subject)
+
+
+def _source_problems(network: Specification, node: Node, subject: str) -> Iterator[str]:
+    """Yield why the contents of a stock cannot change in time, whatever flows."""
+    remedy = "a stock mixes what enters it; only what a source gives, or what a history was, may change in time"
+    for arc in network.arcs:
+        if arc.recipient == node.id:
+            yield f"{subject}: arc '{arc.id}' enters it: {remedy}"
+        elif arc.donor == node.id and arc.law not in (Law.CONTROLLED, Law.EXOGENOUS):
+            yield f"{subject}: arc '{arc.id}' leaves it by law '{arc.law}': {remedy}, by schedule"
 
 
 def _transfer_problems(arc: Arc, substances: list[str]) -> Iterator[str]:

@@ -21,6 +21,7 @@ from cirl_marl.network.elements import (
 from cirl_marl.network.initial_ages import age_problems
 from cirl_marl.network.series import Series, extremes
 from cirl_marl.network.specification import Specification
+from cirl_marl.network.substances import is_past
 from cirl_marl.network.validation.settings import is_whole
 
 OWN_DEMANDS = (
@@ -83,7 +84,7 @@ def series_problems(network: Specification) -> Iterator[str]:
     for prefix, part in owners:
         for name, declaration, value in numbers(part):
             if isinstance(value, Series):
-                past = isinstance(declaration, Quantity) and declaration.past
+                past = (isinstance(declaration, Quantity) and declaration.past) or is_past(part, name)
                 faults = list(value.problems())
                 if not faults:
                     faults = [
