@@ -47,7 +47,8 @@ def import_(
 ) -> None:
     """Make a network of a table of flows: processes become nodes, what passes through them shares, years series.
 
-    A long table has the columns source, target, year, value, unit, and may have type, region and uncertainty.
+    A long table has the columns source, target, year, value, unit, and may have type, region, uncertainty and
+    substance: rows that name one say how much of it is in a flow, in % or as an amount.
     What sources and sinks are is asked for, or given. The neutral simulation of the network gives back the table.
     """
     from cirl_marl.importing.assembly import import_flows
@@ -70,8 +71,7 @@ def import_(
     if report.changes:
         say(f"{len(report.changes)} flows were adjusted; the largest changes are")
         for change in sorted(report.changes, key=lambda entry: -abs(entry.after - entry.before))[:CHANGES_SHOWN]:
-            place = f"{change.region}, {change.year}" if change.region else str(change.year)
-            say(f"  {change.pair} ({place}): {change.before:g} → {change.after:g} {table.unit}")
+            say(f"  {change.pair} ({change.place}): {change.before:g} → {change.after:g} {table.unit}")
     if report.reconciliation is not None:
         _say_plausibility(report.reconciliation)
     for name, apart in report.stock_mistakes.items():
@@ -81,6 +81,11 @@ def import_(
         moved = max((abs(change.after - change.before) for change in report.changes), default=0.0)
         which = f"the adjusted table, which is up to {moved:.2g} {table.unit} from the original"
     say(f"simulated without agents, no flow is further than {report.largest_error:.2g} {table.unit} from {which}")
+    if table.substances is not None:
+        part = f"{100 * report.content_error:.2g} % of the flow"
+        say(
+            f"of {', '.join(table.substances.names)} no flow is further than {part} from it; stores mix what is in them"
+        )
     say(f"wrote {', '.join(map(str, report.files))}")
 
 

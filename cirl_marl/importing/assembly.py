@@ -23,6 +23,8 @@ from cirl_marl.records.files import publish_folder, write_table
 
 MOST_LINES = 10
 """Most residuals that a message lists."""
+NOTICEABLE = 1e-6
+"""Part of the largest flow of a region below which the content of a flow does not count."""
 WRONG = 1e-5
 """Part of the largest flow of a region by which a simulated flow may miss the table."""
 
@@ -40,6 +42,7 @@ class ImportReport:
     reconciliation: Annotated[Reconciliation | None, "how flows were adjusted; None if they balanced"]
     stock_mistakes: Annotated[Mapping[str, float], "by store how far its stocks and flows are apart at most, mass"]
     largest_error: Annotated[float, "largest difference between a simulated flow and the table, mass/time"]
+    content_error: Annotated[float, "largest difference between a simulated content and the table, as stores mix"]
     files: Annotated[tuple[Path, ...], "what was written, the definition first"]
 
     @property
@@ -97,10 +100,17 @@ def import_flows(
     processes = Processes(table, _matching_processes(table, [*stores, *_stock_processes(table, known_stocks)], "store"))
     _check_stores(processes, stores)
     reconciliation: Reconciliation | None = None
-    if residuals := processes.residuals:
-        if not reconcile:
+    residuals = processes.residuals
+    if not reconcile:
+        processes.check_contents()
+        if residuals:
             raise CirlError(_imbalance_message(table, residuals))
+    elif residuals:
         table, reconciliation = processes.reconcile()
+        processes = Processes(table, processes.of(ProcessKind.STORE))
+    if reconcile and table.substances is not None:
+        table, of_substances = processes.reconcile_substances()
+        reconciliation = of_substances if reconciliation is None else reconciliation + of_substances
         processes = Processes(table, processes.of(ProcessKind.STORE))
     role_of = _roles(table, processes, roles, ask)
     name = identifiers([out.stem])[out.stem]
@@ -119,10 +129,17 @@ def import_flows(
     changes = () if reconciliation is None else reconciliation.changes
     with publish_folder(out.parent) as partial:
         files = _write(partial, out.name, name, definition, changes)
-        error = _largest_error(partial / out.name, table, definition, progress)
+        error, content_error = _largest_errors(partial / out.name, table, processes, definition, progress)
     mistakes = processes.stock_mistakes(known_stocks)
     return ImportReport(
-        table, processes, role_of, reconciliation, mistakes, error, tuple(out.parent / file for file in files)
+        table,
+        processes,
+        role_of,
+        reconciliation,
+        mistakes,
+        error,
+        content_error,
+        tuple(out.parent / file for file in files),
     )
 
 
@@ -194,8 +211,10 @@ def _imbalance_message(table: FlowTable, residuals: Sequence[Residual]) -> str:
 def _write(folder: Path, file: str, name: str, definition: ImportedFiles, changes: Sequence[Change]) -> list[str]:
     """Write the files and return their names."""
     header = ["region", "year", "source", "target", "type", "before", "after", "deviation", "in deviations"]
+    of_substances = any(change.substance for change in changes)
+    header += ["substance"] * of_substances
     change_rows = [
-        [c.region, c.year, *c.pair, c.before, c.after, c.deviation, c.in_deviations]
+        [c.region, c.year, *c.pair, c.before, c.after, c.deviation, c.in_deviations, *[c.substance] * of_substances]
         for c in sorted(changes, key=lambda change: -abs(change.after - change.before))
     ]
     tables: dict[str, list[list[object]]] = {
@@ -210,13 +229,19 @@ def _write(folder: Path, file: str, name: str, definition: ImportedFiles, change
     return [file, *non_empty]
 
 
-def _largest_error(path: Path, table: FlowTable, definition: ImportedFiles, progress: Callable[[float], None]) -> float:
-    """Simulate every region without agents, and return how far a flow is from the table.
+def _largest_errors(
+    path: Path,
+    table: FlowTable,
+    processes: Processes,
+    definition: ImportedFiles,
+    progress: Callable[[float], None],
+) -> tuple[float, float]:
+    """Simulate every region without agents, and return how far a flow, and a content, is from the table.
 
     Raises:
-        CirlError: for a flow that the network does not give back.
+        CirlError: for a flow that the network does not give back, or without stores a content.
     """
-    worst = 0.0
+    worst, worst_content = 0.0, 0.0
     ids = identifiers(table.regions) if table.regions != ("",) else {"": ""}
     flows = table.grid(table.values)
     for done, (region, id_) in enumerate(ids.items()):
@@ -237,5 +262,15 @@ def _largest_error(path: Path, table: FlowTable, definition: ImportedFiles, prog
                 f"{table.unit}; a store may run empty: give stocks"
             )
         worst = max(worst, float(errors.max()))
+        if table.substances is not None:
+            places = len(network.nodes) + np.array(order)
+            amounts = run.contents[:, :, places].swapaxes(0, 1) * run.flow[:, order]
+            errors = np.abs(amounts - table.substances.amounts[:, done])
+            flows_of_year = np.maximum(table_flows, NOTICEABLE * table_flows.max())
+            s, y, k = np.unravel_index(int((errors / flows_of_year).argmax()), errors.shape)
+            worst_content = max(worst_content, float((errors / flows_of_year)[s, y, k]))
+            if errors.max() > WRONG * table_flows.max() and not processes.of(ProcessKind.STORE):
+                flow = f"{table.substances.names[s]} of {[*definition.arcs][k]} in {table.years[y]}"
+                raise CirlError(f"{table.name}: the network does not give back {flow}; does it balance?")
         progress((done + 1) / len(ids))
-    return worst
+    return worst, worst_content

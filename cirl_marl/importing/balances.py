@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from enum import StrEnum
 from typing import Annotated
@@ -12,6 +12,7 @@ from scipy.special import chdtrc
 
 from cirl_marl.errors import CirlError
 from cirl_marl.importing.flow_table import Connection, FlowTable
+from cirl_marl.importing.substance_flows import closest_amounts, degrees_of_freedom, excesses
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record
 
@@ -42,10 +43,11 @@ class Residual:
     year: Annotated[int, "the year"]
     inflow: Annotated[float, "sum of its inflows"]
     outflow: Annotated[float, "sum of its outflows"]
+    substance: Annotated[str, "of which; empty: of the whole"] = ""
 
     def __str__(self) -> str:
         """Say it as in a message."""
-        place = f"{self.region}, {self.year}" if self.region else str(self.year)
+        place = ", ".join(filter(None, (self.region, str(self.year), self.substance)))
         return f"'{self.process}' ({place}): {self.inflow:g} enter, {self.outflow:g} leave"
 
 
@@ -59,6 +61,12 @@ class Change:
     before: Annotated[float, "as the table has it"]
     after: Annotated[float, "as it was adjusted"]
     deviation: Annotated[float, "standard deviation that it was weighted by"]
+    substance: Annotated[str, "of which; empty: of the whole"] = ""
+
+    @property
+    def place(self) -> str:
+        """Where and when it is, and of what."""
+        return ", ".join(filter(None, (self.region, str(self.year), self.substance)))
 
     @property
     def in_deviations(self) -> float:
@@ -84,6 +92,11 @@ class Reconciliation:
         """Flows that were moved by more than two standard deviations, the furthest first."""
         return sorted((c for c in self.changes if abs(c.in_deviations) > 2), key=lambda c: -abs(c.in_deviations))
 
+    def __add__(self, addend: Reconciliation) -> Reconciliation:
+        """Return all changes of both, as one."""
+        chi_square, degrees = self.chi_square + addend.chi_square, self.degrees + addend.degrees
+        return Reconciliation(self.changes + addend.changes, chi_square, degrees)
+
 
 class Processes:
     """The processes of a table.
@@ -107,7 +120,7 @@ class Processes:
         for k, pair in enumerate(table.pairs):
             self._incidence[self._place[pair.source], k] -= 1.0
             self._incidence[self._place[pair.target], k] += 1.0
-        inflow, outflow = self._sums(1.0), self._sums(-1.0)
+        inflow, outflow = self._sums(1.0, self.flows), self._sums(-1.0, self.flows)
         stays = inflow - outflow
         beyond = np.abs(stays) > self._tolerance()[:, None, None]
         whole = inflow.sum(axis=(0, 1))
@@ -135,15 +148,33 @@ class Processes:
 
     @property
     def residuals(self) -> list[Residual]:
-        """What does not balance beyond rounding, the largest first."""
-        inflow, outflow = self._sums(1.0), self._sums(-1.0)
-        transit = np.array([kind is ProcessKind.TRANSIT for kind in self.kinds.values()])
-        wrong = (np.abs(inflow - outflow) > self._tolerance()[:, None, None]) & transit
+        """What does not balance beyond rounding, of the whole and of substances, the largest first."""
+        substances = self._table.substances
+        tables = {} if substances is None else dict(zip(substances.names, substances.amounts, strict=True))
         residuals = [
-            Residual(self.names[i], self._table.regions[r], self._table.years[y], inflow[r, y, i], outflow[r, y, i])
-            for r, y, i in np.argwhere(wrong).tolist()
+            residual for name, flows in {"": self.flows, **tables}.items() for residual in self._off(name, flows)
         ]
         return sorted(residuals, key=lambda residual: -abs(residual.inflow - residual.outflow))
+
+    def _off(self, substance: str, flows: Floats) -> Iterator[Residual]:
+        inflow, outflow = self._sums(1.0, flows), self._sums(-1.0, flows)
+        transit = np.array([kind is ProcessKind.TRANSIT for kind in self.kinds.values()])
+        wrong = (np.abs(inflow - outflow) > ROUNDING * flows.max(axis=(1, 2))[:, None, None]) & transit
+        regions, years = self._table.regions, self._table.years
+        for r, y, i in np.argwhere(wrong).tolist():
+            yield Residual(self.names[i], regions[r], years[y], inflow[r, y, i], outflow[r, y, i], substance)
+
+    def check_contents(self) -> None:
+        """Refuse flows in which there is more of substances than they are; a ``CirlError`` names the first."""
+        table = self._table
+        if table.substances is None:
+            return
+        for r, y, k in excesses(table.substances.amounts, self.flows):
+            place = f"{table.regions[r]}, {table.years[y]}" if table.regions[r] else str(table.years[y])
+            parts = zip(table.substances.names, table.substances.amounts[:, r, y, k].tolist(), strict=True)
+            listing = " and ".join(f"{amount:g} {name}" for name, amount in parts if amount)
+            flow = f"{table.pairs[k]} ({place}): {listing} in {self.flows[r, y, k]:g} {table.unit}"
+            raise CirlError(f"{table.name}: {flow}: no more than all of it; correct the table, or give --reconcile")
 
     def reconcile(self) -> tuple[FlowTable, Reconciliation]:
         """Return flows that balance and are closest to those of the table, what was changed, and how plausible that is.
@@ -173,7 +204,42 @@ class Processes:
                 for k in np.flatnonzero(np.abs(closest - table_flow) > 1e-9 * table_flow.max()).tolist():
                     flows[r, y, k] = after = float(closest[k])
                     changes.append(Change(region, year, table.pairs[k], table_flow[k], after, float(deviations[k])))
-        return replace(table, values=flows[table.cells]), Reconciliation(tuple(changes), chi_square, degrees)
+        substances = table.substances
+        if substances is not None:
+            substances = substances.of_flows(self.flows, flows)
+        return replace(table, values=flows[table.cells], substances=substances), Reconciliation(
+            tuple(changes), chi_square, degrees
+        )
+
+    def reconcile_substances(self) -> tuple[FlowTable, Reconciliation]:
+        """Return substances that balance, are closest to those of the table and within the flows, and what was changed.
+
+        The flows stay: each substance balances at every process without stock, and all are together at most the flow
+        (``closest_amounts``). Their deviations are as those of flows, 10 % of amounts that state none.
+        """
+        table, substances = self._table, self._table.substances
+        assert substances is not None
+        balances = self._incidence[[kind is ProcessKind.TRANSIT for kind in self.kinds.values()]]
+        stated, before = substances.deviations, substances.amounts
+        deviations = np.where(before > 0, np.where(np.isnan(stated), UNCERTAIN * before, stated), 0.0)
+        amounts, changes, chi_square, degrees = before.copy(), [], 0.0, 0
+        for r, region in enumerate(table.regions):
+            for y, year in enumerate(table.years):
+                spread, measured = deviations[:, r, y], before[:, r, y]
+                closest = closest_amounts(measured, spread, self.flows[r, y], balances)
+                if closest is None:
+                    place = f"{region}, {year}" if region else str(year)
+                    fault = f"no amounts of {' and '.join(substances.names)} balance within the flows"
+                    raise CirlError(f"{table.name}: {place}: {fault}; state how uncertain they are")
+                amounts[:, r, y] = closest
+                change = np.divide(closest - measured, spread, out=np.zeros_like(closest), where=spread > 0)
+                chi_square += float((change**2).sum())
+                degrees += degrees_of_freedom(spread, balances)
+                for e, k in np.argwhere(np.abs(closest - measured) > 1e-9 * self.flows[r, y].max()).tolist():
+                    cells = float(measured[e, k]), float(closest[e, k]), float(spread[e, k])
+                    changes.append(Change(region, year, table.pairs[k], *cells, substances.names[e]))
+        result = replace(table, substances=replace(substances, amounts=amounts))
+        return result, Reconciliation(tuple(changes), chi_square, degrees)
 
     def stock_mistakes(self, stocks: Mapping[tuple[str, str, int], float]) -> dict[str, float]:
         """Return, for each process with stocks, the largest difference between their growth and what the flows say.
@@ -189,10 +255,10 @@ class Processes:
                 worst[name] = max(worst.get(name, 0.0), abs(stock - before - growth))
         return worst
 
-    def _sums(self, sign: float) -> Floats:
+    def _sums(self, sign: float, flows: Floats) -> Floats:
         """Return what enters (1) or leaves (−1) each process, shape (regions, years, processes)."""
         ends = np.maximum(sign * self._incidence, 0.0)
-        return np.asarray(self.flows @ ends.T)
+        return np.asarray(flows @ ends.T)
 
     def _tolerance(self) -> Floats:
         """Return what counts as rounding in each region, shape (regions,)."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import unicodedata
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -16,6 +16,10 @@ from cirl_marl.importing.flow_table import Connection, FlowTable
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record, with_field_docs
 from cirl_marl.network.elements import Role
+
+ALIKE = 1e-7
+"""Part of the largest flow by which amounts may differ that count as alike, as tables are rounded."""
+SMALL = 1e-300
 
 
 @positional_record
@@ -105,6 +109,75 @@ class DefinitionWriter:
         names = identifiers(texts.values())
         self._arcs = {pair: names[texts[pair]] for pair in table.pairs}
         self._regions = identifiers(table.regions) if self._regional else {}
+        self._substances: dict[str, Floats] = {}
+        if table.substances is not None:
+            ids = identifiers(table.substances.names)
+            self._substances = {ids[name]: amounts for name, amounts in zip(ids, table.substances.amounts, strict=True)}
+        self._separate_sources()
+        self._handed_on = self._splits()
+
+    def _separate_sources(self) -> None:
+        """Give each arc a source of its own where what a source gives differs from arc to arc."""
+        self._donors = {pair: self._nodes[pair.source] for pair in self.table.pairs}
+        self._sources: dict[str, list[Connection]] = {}
+        titles: dict[Connection, str] = {}
+        for process in self.processes.of(ProcessKind.SOURCE):
+            pairs = self._pairs_from(process)
+            if self._is_alike(pairs):
+                self._sources[self._nodes[process]] = pairs
+            else:
+                titles |= {pair: f"{process} for {pair.target} {pair.type}".rstrip() for pair in pairs}
+        ids = identifiers([*self._nodes.values(), *self._arcs.values(), *titles.values()])
+        self._titles = {ids[title]: (title, pair.source) for pair, title in titles.items()}
+        for pair, title in titles.items():
+            self._donors[pair] = ids[title]
+            self._sources[ids[title]] = [pair]
+
+    def _pairs_from(self, process: str) -> list[Connection]:
+        return [pair for pair in self.table.pairs if pair.source == process]
+
+    def _of_pairs(self, table: Floats, pairs: Sequence[Connection]) -> Floats:
+        """Return the columns of flows of some pairs, shape (regions, years, pairs)."""
+        places = [k for k, pair in enumerate(self.table.pairs) if pair in pairs]
+        return np.asarray(table[:, :, places])
+
+    def _is_alike(self, pairs: Sequence[Connection]) -> bool:
+        """Whether flows have the same contents at all times."""
+        flows = self._of_pairs(self.processes.flows, pairs)
+        for amounts in self._substances.values():
+            parts = self._of_pairs(amounts, pairs)
+            mean = parts.sum(axis=2, keepdims=True) * flows / flows.sum(axis=2, keepdims=True).clip(SMALL)
+            if (np.abs(parts - mean) > ALIKE * flows.max()).any():
+                return False
+        return True
+
+    def _contents(self, pairs: Sequence[Connection]) -> dict[str, Floats]:
+        """Return the content of flows together by substance, (regions, years); without flow that of a near year."""
+        flows = self._of_pairs(self.processes.flows, pairs).sum(axis=2)
+        contents = {}
+        for id_, amounts in self._substances.items():
+            parts = self._of_pairs(amounts, pairs).sum(axis=2)
+            contents[id_] = shares_of(np.stack([parts, np.maximum(flows - parts, 0.0)], axis=2))[..., 0]
+        return contents
+
+    def _splits(self) -> dict[str, Floats]:
+        """Return the columns of the data file of what processes without stock hand on: shares and transfers."""
+        columns: dict[str, Floats] = {}
+        whole, parts = self.processes.flows, self._substances
+        remainder = np.maximum(whole - sum(parts.values(), np.zeros_like(whole)), 0.0) if parts else whole
+        for process in self.processes.of(ProcessKind.TRANSIT):
+            pairs = self._pairs_from(process)
+            rest = self._of_pairs(remainder, pairs)
+            shares = shares_of(rest if rest.any() else self._of_pairs(whole, pairs))
+            arcs = [self._arcs[pair] for pair in pairs]
+            columns |= {arc: shares[:, :, k] for k, arc in enumerate(arcs)}
+            for id_, table in parts.items():
+                amounts = self._of_pairs(table, pairs)
+                through = amounts.sum(axis=2, keepdims=True)
+                if (np.abs(amounts - shares * through) > ALIKE * self._of_pairs(whole, pairs).max()).any():
+                    transfers = shares_of(amounts)
+                    columns |= {f"{arc} {id_}": transfers[:, :, k] for k, arc in enumerate(arcs)}
+        return columns
 
     def files(self) -> ImportedFiles:
         """Write everything."""
@@ -127,6 +200,10 @@ class DefinitionWriter:
         yield from ("", "[scales]")
         yield f"stock = {self._scale('stock', stock, self._mass, 'the largest flow, times the years')}"
         yield f"flow = {self._scale('flow', flow, unit, 'the largest flow')}"
+        for id_, amounts in self._substances.items():
+            largest = float(np.max(amounts.sum(axis=(1, 2)) / self.processes.flows.sum(axis=(1, 2)))) or 1.0
+            scale = f'{{ value = {largest:.2g}, unit = "1", source = "its mean content" }}'
+            yield from ("", f"[substances.{id_}]", f"scale = {scale}")
         yield from ("", "[episode]", f"start = {years[0]}")
         yield 'control_interval = { value = 1, unit = "year", source = "the table has years" }'
         yield f'horizon = {{ value = {len(years)}, unit = "1", source = "{years[0]} to {years[-1]}" }}'
@@ -148,11 +225,17 @@ class DefinitionWriter:
         if not self._regional:
             return []
         stores = [process for process in self.processes.of(ProcessKind.STORE) if self._first_stocks(process)]
+        contents = {
+            f"{substance} of {self._nodes[store]}": content[:, 0]
+            for store in self.processes.of(ProcessKind.STORE)
+            for substance, content in self._contents(self._pairs_from(store)).items()
+        }
         rows: list[list[object]] = [
-            ["region", "flow", "stock", *(f"stock of {self._nodes[store]}" for store in stores)]
+            ["region", "flow", "stock", *(f"stock of {self._nodes[store]}" for store in stores), *contents]
         ]
-        for region, scales in zip(self.table.regions, self._references(), strict=True):
-            rows.append([region, *scales, *(self._first_stocks(store)[region] for store in stores)])
+        for r, (region, scales) in enumerate(zip(self.table.regions, self._references(), strict=True)):
+            stocks = [self._first_stocks(store)[region] for store in stores]
+            rows.append([region, *scales, *stocks, *(content[r] for content in contents.values())])
         return rows
 
     def _scale(self, column: str, value: float, unit: str, source: str) -> str:
@@ -164,8 +247,14 @@ class DefinitionWriter:
         return f'file = "{self.name}_regions.csv", column = "{column}", where = {{ region = "{{region}}" }}'
 
     def _node_tables(self) -> Iterator[str]:
+        for id_, (title, process) in self._titles.items():
+            yield from ("", f"[nodes.{id_}]", f"title = {_text(title)}")
+            yield f'role = "{self.roles.get(process, Role.TECHNOSPHERE).value}"'
+            yield from self._stated_contents(id_)
         for process, id_ in self._nodes.items():
             kind = self.processes.kinds[process]
+            if kind is ProcessKind.SOURCE and id_ not in self._sources:
+                continue  # which stands above, by arcs
             yield from ("", f"[nodes.{id_}]")
             if id_ != process:
                 yield f"title = {_text(process)}"
@@ -179,6 +268,24 @@ class DefinitionWriter:
                 yield stock
             elif kind is ProcessKind.STORE:
                 yield "# no initial stock is known: it starts with what leaves it in all these years"
+            if kind is ProcessKind.SOURCE:
+                yield from self._stated_contents(id_)
+            elif kind is ProcessKind.STORE:
+                source = _text(f"of what leaves it in {self.table.years[0]}")
+                for substance, content in self._contents(self._pairs_from(process)).items():
+                    place = f"value = {_short(content[0, 0])}"
+                    if self._regional:
+                        place = self._of_region(f"{substance} of {id_}")
+                    yield f'content.{substance} = {{ {place}, unit = "1", source = {source} }}'
+
+    def _stated_contents(self, source: str) -> Iterator[str]:
+        """Yield the contents of a source: numbers where they stay the same."""
+        for substance, content in self._contents(self._sources[source]).items():
+            if (content == content[0, 0]).all():
+                value = f"value = {_short(content[0, 0])}"
+                yield f'content.{substance} = {{ {value}, unit = "1", source = {_text(self.source)} }}'
+            else:
+                yield f"content.{substance} = {self._column(f'{source} {substance}', '1')}"
 
     def _initial(self, process: str) -> str:
         """Return the initial stock of a store, if it is known."""
@@ -200,13 +307,19 @@ class DefinitionWriter:
             yield from ("", f"[arcs.{id_}]")
             if pair.type:
                 yield f"title = {_text(pair.type)}"
-            yield from (f'from = "{self._nodes[pair.source]}"', f'to = "{self._nodes[pair.target]}"')
+            yield from (f'from = "{self._donors[pair]}"', f'to = "{self._nodes[pair.target]}"')
             if self.processes.kinds[pair.source] is not ProcessKind.TRANSIT:
                 yield from ('law = "exogenous"', f"flow = {self._column(id_, self.table.unit)}")
             elif self._rest(pair):
                 yield from ('law = "share"', 'share = "rest"')
             else:
                 yield from ('law = "share"', f"share = {self._column(id_, '1')}")
+                columns = {substance: f"{id_} {substance}" for substance in self._substances}
+                yield from (
+                    f"transfer.{substance} = {self._column(column, '1')}"
+                    for substance, column in columns.items()
+                    if column in self._handed_on
+                )
 
     def _rest(self, pair: Connection) -> bool:
         """Whether the share of a pair is what the others leave: of the largest flow out of its process."""
@@ -221,12 +334,12 @@ class DefinitionWriter:
 
     def _data(self) -> list[list[object]]:
         """Return header and rows of the data file, in the order of regions and years."""
-        table, flows = self.table, self.processes.flows
-        values = flows.copy()
-        for process in self.processes.of(ProcessKind.TRANSIT):
-            outflows = [k for k, pair in enumerate(table.pairs) if pair.source == process]
-            values[:, :, outflows] = shares_of(flows[:, :, outflows])
-        rows: list[list[object]] = [[*(["region"] if self._regional else []), "year", *self._arcs.values()]]
+        table = self.table
+        columns = {arc: self.processes.flows[:, :, k] for k, arc in enumerate(self._arcs.values())} | self._handed_on
+        for source, pairs in self._sources.items():
+            columns |= {f"{source} {substance}": content for substance, content in self._contents(pairs).items()}
+        values = np.stack([*columns.values()], axis=2)
+        rows: list[list[object]] = [[*(["region"] if self._regional else []), "year", *columns]]
         for region, of_region in zip(table.regions, values.tolist(), strict=True):
             for year, row in zip(table.years, of_region, strict=True):
                 rows.append([*([region] if self._regional else []), year, *map(_short, row)])

@@ -14,6 +14,7 @@ import numpy as np
 from cirl_marl.definitions.data_files import no_collection, number_in
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.importing.grids import Grid, GridPart, Memo, is_year, read_grids
+from cirl_marl.importing.substance_flows import SubstanceFlows, SubstanceRows
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.units import factor
@@ -44,6 +45,7 @@ class FlowTable:
     places: Annotated[Integers, "region and pair, counted, with the year between them, shape (3, flows)"]
     values: Annotated[Floats, "the flows, shape (flows,), mass/time"]
     deviations: Annotated[Floats, "standard deviations, NaN where none is stated, shape (flows,), mass/time"]
+    substances: Annotated[SubstanceFlows | None, "what is in the flows; None if the table does not say"] = None
 
     @property
     def years(self) -> tuple[int, ...]:
@@ -81,6 +83,10 @@ class FlowTable:
         orders = [_order_of_appearance(numbers) for numbers in (places[0], places[2])]
         places[0], places[2] = (places_ for _, places_ in orders)
         names = [self.regions[i] for i in orders[0][0]], [self.pairs[i] for i in orders[1][0]]
+        substances, first = self.substances, self.years[0]
+        if substances is not None and places.size:
+            years = slice(int(places[1].min()) - first, int(places[1].max()) - first + 1)
+            substances = substances.part(orders[0][0], years, orders[1][0])
         return replace(
             self,
             regions=tuple(names[0]),
@@ -88,6 +94,7 @@ class FlowTable:
             places=places,
             values=self.values[kept],
             deviations=self.deviations[kept],
+            substances=substances,
         )
 
 
@@ -102,7 +109,8 @@ def read_flows(path: Path, *, sheet: str | None = None, unit: str | None = None,
     """Read a table of flows.
 
     A long table has the columns source, target, year, value and unit, and may have type, region and uncertainty (a
-    standard deviation in the same unit, or in percent, as ``5 %``). Instead of value and unit there may be one column
+    standard deviation in the same unit, or in percent, as ``5 %``). With a column substance, rows that name one say how
+    much of it is in a flow, as a part or an amount. Instead of value and unit there may be one column
     that is named by its unit, as ``kt_per_year``. Any other table is a matrix: its first column names the sources, its
     first line the targets. The sheets of a workbook that are named by years are one matrix each.
 
@@ -124,13 +132,15 @@ def _read_flows(path: Path, sheet: str | None, default_unit: str | None, default
     pairs: dict[Connection, int] = {}
     parts: list[_Entries] = []
     units: dict[str, str] = {}
+    substances = SubstanceRows()
     for grid in read_grids(path, sheet):
         long = {"source", "target"} <= grid.places.keys()
-        for entries in (_long if long else _matrix)(grid, default_year, regions, pairs):
+        of_grid = _long(grid, default_year, regions, pairs, substances) if long else None
+        for entries in of_grid or _matrix(grid, default_year, regions, pairs):
             parts.append(entries)
             for unit_of_row, line in entries.units.items():
                 units.setdefault(unit_of_row, f"{grid.name}, line {line}")
-    if not pairs:
+    if not any(part.places.size for part in parts):
         raise CirlError(f"{path}: has no flows")
     table = FlowTable(
         path.name,
@@ -143,7 +153,12 @@ def _read_flows(path: Path, sheet: str | None, default_unit: str | None, default
     )
     _check_repetitions(table, parts)
     _check_years(table)
-    return replace(table, unit=_unit(path, units, default_unit))
+    table = replace(table, unit=_unit(path, units, default_unit))
+    if not substances.entries:
+        return table
+    labels = list(map(str, table.pairs))
+    found = substances.flows(table.grid(table.values), table.years[0], table.unit, labels)
+    return replace(table, substances=found)
 
 
 def _check_repetitions(table: FlowTable, parts: Sequence[_Entries]) -> None:
@@ -201,9 +216,13 @@ class _Entries:
 
 
 def _long(
-    grid: Grid, default_year: int | None, regions: dict[str, int], pairs: dict[Connection, int]
+    grid: Grid,
+    default_year: int | None,
+    regions: dict[str, int],
+    pairs: dict[Connection, int],
+    substances: SubstanceRows,
 ) -> Iterator[_Entries]:
-    """Yield the flows of a long table, and count the regions and pairs that are new."""
+    """Yield the flows of a long table, and count the regions and pairs that are new; ``substances`` take their rows."""
     unit = ""
     if "value" not in grid.places:
         used_columns = set(grid.places.values())
@@ -220,17 +239,27 @@ def _long(
     pair_numbers = Memo[tuple[str, ...], int](lambda cells: pairs.setdefault(_connection(cells), len(pairs)))
     region_numbers = Memo[str, int](lambda text: regions.setdefault(text.strip(), len(regions)))
     years = Memo(_year)
-    for part in grid.parts():
+
+    def numbers(part: GridPart) -> tuple[Integers, Floats, Floats]:
+        """Return places, values and deviations of rows."""
         year_of_row = [default_year or 0] * len(part.rows)
         if "year" in grid.places:
             year_of_row = part.convert(part.of("year"), years)
         region_of_row = part.convert(part.of("region"), region_numbers)
         pair_of_row = part.convert(list(map(ends, part.rows)), pair_numbers)
         values = part.numbers(grid.places["value"], part.of("value"))
+        places = np.array([region_of_row, year_of_row, pair_of_row], dtype=np.intp)
+        return places, values, _deviations(part, values)
+
+    for part in grid.parts():
+        is_of_substance = [bool(text.strip()) for text in part.of("substance")]
+        if any(is_of_substance):
+            in_flows = part.rows_in(is_of_substance)
+            substances.take(in_flows, unit, *numbers(in_flows))
+            part = part.rows_in([not is_of for is_of in is_of_substance])
         texts = part.of("unit")
         units = {unit or text.strip(): part.lines[texts.index(text)] for text in dict.fromkeys(texts)}
-        places = np.array([region_of_row, year_of_row, pair_of_row], dtype=np.intp)
-        yield _Entries(grid.name, part.lines, places, values, _deviations(part, values), units)
+        yield _Entries(grid.name, part.lines, *numbers(part), units)
 
 
 def _connection(cells: tuple[str, ...]) -> Connection:

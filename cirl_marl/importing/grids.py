@@ -29,6 +29,7 @@ NAMES: Mapping[str, tuple[str, ...]] = {
     "type": ("type", "good", "material"),
     "region": ("region", "country"),
     "uncertainty": ("uncertainty", "deviation"),
+    "substance": ("substance", "element"),
     "process": ("process", "node", "stock of"),
 }
 """What columns may be called, whatever the case."""
@@ -48,6 +49,11 @@ class GridPart:
         if key not in self.grid.places:
             return [""] * len(self.rows)
         return list(map(itemgetter(self.grid.places[key]), self.rows))
+
+    def rows_in(self, mask: Sequence[bool]) -> GridPart:
+        """Return the rows of a mask."""
+        places = [i for i, is_in in enumerate(mask) if is_in]
+        return GridPart(self.grid, [self.lines[i] for i in places], [self.rows[i] for i in places])
 
     def convert(self, texts: Sequence[K], values: Memo[K, V]) -> list[V]:
         """Return what the texts of each row mean; a ``CirlError`` of one that means nothing names its line as well."""

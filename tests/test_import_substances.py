@@ -1,0 +1,365 @@
+"""Substances in tables of flows: import, round trips and reconciliation."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+from typer.testing import CliRunner
+
+from cirl_marl import (
+    Arc,
+    CirlError,
+    Episode,
+    Law,
+    MultiAgentVectorEnv,
+    Network,
+    Node,
+    Role,
+    Series,
+    Substance,
+    load_network,
+)
+from cirl_marl.cli import app
+from cirl_marl.importing.assembly import ImportReport, import_flows
+from cirl_marl.importing.substance_flows import closest_amounts
+
+HEADER = ["source", "target", "year", "substance", "value", "unit", "uncertainty"]
+ROLES = {"nonrenewable_reservoir": ["Mine*"], "landfill": ["[DP]*[pt]"]}
+Row = Sequence[object]
+
+
+def table(path: Path, rows: Sequence[Row], header: Sequence[str] = HEADER) -> Path:
+    """Write a CSV file."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([header, *rows])
+    return path
+
+
+def sorting(copper: Sequence[object] = (4, 1, 3), unit: str = "kt/year") -> list[list[object]]:
+    """Return ore that is sorted, with the copper in ore, product and dump."""
+    flows = (("Mine", "Sorter", 100), ("Sorter", "Product", 90), ("Sorter", "Dump", 10))
+    rows: list[list[object]] = [[*ends, 2000, "", value, "kt/year", "10 %"] for *ends, value in flows]
+    rows += [
+        [*ends, 2000, "Copper", part, unit, "10 %"]
+        for (*ends, _), part in zip(flows, copper, strict=True)
+        if part != ""
+    ]
+    return rows
+
+
+def imported(tmp_path: Path, rows: Sequence[Row], **options: object) -> ImportReport:
+    """Import a table."""
+    return import_flows(table(tmp_path / "flows.csv", rows), tmp_path / "net.toml", roles=ROLES, **options)  # type: ignore[arg-type]
+
+
+def simulated(network: Network) -> tuple[np.ndarray, np.ndarray]:
+    """Return flows, (steps, arcs), and substances in them, (steps, substances, arcs), without agents."""
+    env = MultiAgentVectorEnv(network, num_envs=1)
+    env.reset(seed=0)
+    flows, substances = [], []
+    for _ in range(network.episode.horizon):
+        env.advance(np.zeros((len(env.actuators.control_rows), 1)))
+        flows.append(env.physical.flow[:, 0])
+        substances.append(env.physical.substances.reshape(len(network.substances), -1))
+    return np.array(flows), np.array(substances)
+
+
+@pytest.mark.parametrize(("amounts", "unit"), [((4, 1, 3), "kt/year"), ((4, 10 / 9, 30), "%"), ((4, 1, 3), "kt")])
+def test_contents_and_amounts_become_shares_of_each(amounts: Sequence[float], unit: str, tmp_path: Path) -> None:
+    """A process that separates has shares of copper of its own; a table may say parts or amounts."""
+    report = imported(tmp_path, sorting(amounts, unit))
+    network = load_network(tmp_path / "net.toml")
+    assert [substance.id for substance in network.substances] == ["copper"]
+    assert dict(network.nodes[0].content)["copper"] == pytest.approx(0.04)
+    dumped = network.compartments["sorter_to_dump"]
+    assert isinstance(dumped, Arc) and isinstance(dumped.share, Series)
+    assert dumped.share.values[0] == pytest.approx(7 / 96)
+    assert network.interval_means(dict(dumped.transfer)["copper"])[0] == pytest.approx(0.75)
+    assert report.content_error < 1e-9
+
+
+def test_what_a_process_does_not_separate_has_no_transfer(tmp_path: Path) -> None:
+    """Where all that leaves is alike shares are enough, and a content that stays the same is a number."""
+    imported(tmp_path, sorting((4, 3.6, 0.4)))
+    text = (tmp_path / "net.toml").read_text()
+    assert "transfer" not in text and "content.copper = { value = 0.04," in text
+
+
+def test_sources_that_give_different_things_become_several(tmp_path: Path) -> None:
+    """An arc with contents of its own has a source of its own, with the role of the one of the table."""
+    rows = [*sorting((4, 1, 3)), ["Mine", "Product", 2000, "", 50, "kt/year", ""]]
+    rows.append(["Mine", "Product", 2000, "Copper", 0.1, "%", ""])
+    imported(tmp_path, rows)
+    network = load_network(tmp_path / "net.toml")
+    sources = [node for node in network.nodes if node.role is Role.NONRENEWABLE_RESERVOIR]
+    assert {node.title: network.interval_means(dict(node.content)["copper"])[0].round(9) for node in sources} == {
+        "Mine for Sorter": 0.04,
+        "Mine for Product": 0.001,
+    }
+
+
+def cascade(seed: int, years: int = 4) -> Network:
+    """Return a random network of two sources, three processes that separate and two sinks, with contents in time."""
+    rng = np.random.default_rng(seed)
+
+    def series(low: float, high: float) -> Series:
+        return Series(times=tuple(map(float, range(years))), values=tuple(rng.uniform(low, high, years).tolist()))
+
+    def content() -> dict[str, Series]:
+        return {"copper": series(0.0, 0.4), "tin": series(0.0, 0.3)}
+
+    def split(donor: str, recipients: Sequence[str]) -> list[Arc]:
+        arcs = []
+        for recipient in recipients[1:]:
+            transfer = {"copper": series(0.05, 0.45)} if rng.random() < 0.7 else {}
+            arcs.append(
+                Arc(
+                    id=f"{donor}_to_{recipient}",
+                    donor=donor,
+                    recipient=recipient,
+                    law=Law.SHARE,
+                    share=series(0.05, 0.45),
+                    transfer=transfer,
+                )
+            )
+        return [Arc(id=f"{donor}_to_{recipients[0]}", donor=donor, recipient=recipients[0], law=Law.SHARE), *arcs]
+
+    return Network(
+        name="cascade",
+        nodes=(
+            *(Node(id=f"mine_{i}", role=Role.NONRENEWABLE_RESERVOIR, content=content()) for i in range(2)),
+            *(Node(id=f"process_{i}", stores=False) for i in range(3)),
+            *(Node(id=id_, role=Role.LANDFILL, initial=(0.0, 0.0)) for id_ in ("dump", "product")),
+        ),
+        arcs=(
+            *(
+                Arc(
+                    id=f"mine_{i}_to_process_{j}",
+                    donor=f"mine_{i}",
+                    recipient=f"process_{j}",
+                    law=Law.EXOGENOUS,
+                    flow=series(1.0, 9.0),
+                )
+                for i, j in ((0, 0), (0, 1), (1, 0))
+            ),
+            *split("process_0", ("process_1", "dump")),
+            *split("process_1", ("product", "dump", "process_2")),
+            *split("process_2", ("process_0", "product")),
+        ),
+        substances=(Substance(id="copper"), Substance(id="tin")),
+        mass_unit="kt",
+        time_unit="year",
+        episode=Episode(control_interval=1.0, horizon=years),
+    )
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_simulated_contents_come_back(seed: int, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """A table of the flows and contents of a network is imported as one that has these flows and contents."""
+    network = cascade(seed)
+    flows, substances = simulated(network)
+    rows: list[Row] = []
+    for y, k in np.ndindex(flows.shape):
+        arc = network.arcs[k]
+        ends = [arc.donor.capitalize(), arc.recipient.capitalize(), 2000 + y]
+        rows.append([*ends, "", float(flows[y, k]), "kt/year", ""])
+        content = substances[y, :, k] / flows[y, k]
+        rows.append([*ends, "copper", float(substances[y, 0, k]), "kt/year", ""])
+        rows.append([*ends, "tin", float(100 * content[1]), "%", ""])
+    report = imported(tmp_path_factory.mktemp("trip"), rows)
+    again = load_network(report.files[0])
+    flows_again, substances_again = simulated(again)
+    order = [again.arc_index[arc.id] for arc in network.arcs]
+    np.testing.assert_allclose(flows_again[:, order], flows, rtol=1e-9)
+    np.testing.assert_allclose(substances_again[..., order], substances, rtol=1e-8, atol=1e-9)
+    assert report.content_error < 1e-9
+
+
+def test_stores_mix_what_the_table_says(tmp_path: Path) -> None:
+    """A store starts with the content of what leaves it first, and the report says how far mixing is from the table."""
+    rows: list[Row] = []
+    for y, back in enumerate((0.02, 0.02, 0.03)):
+        rows += [["Mine", "Use", 2000 + y, s, v, "kt/year", ""] for s, v in (("", 10.0), ("Copper", 0.2))]
+        rows += [["Use", "Dump", 2000 + y, s, v, "kt/year", ""] for s, v in (("", 5.0), ("Copper", 5 * back))]
+    report = imported(tmp_path, rows, stores=["Use"])
+    use = load_network(tmp_path / "net.toml").compartments["use"]
+    assert isinstance(use, Node) and dict(use.content)["copper"] == pytest.approx(0.02)
+    assert report.content_error == pytest.approx(0.01, rel=1e-6)
+
+
+def test_regions_have_contents_of_their_own(tmp_path: Path) -> None:
+    """Each is a network with its contents, of sources and of stores."""
+    header = [*HEADER, "region"]
+    rows: list[Row] = []
+    for region, part in (("North", 0.02), ("South", 0.05)):
+        for y in range(2):
+            for source, target, value in (("Mine", "Use", 10.0), ("Use", "Dump", 4.0)):
+                rows.append([source, target, 2000 + y, "", value, "kt/year", "", region])
+                rows.append([source, target, 2000 + y, "Copper", value * part, "kt/year", "", region])
+    path = table(tmp_path / "flows.csv", rows, header)
+    import_flows(path, tmp_path / "net.toml", roles=ROLES, stores=["Use"])
+    for region, part in (("north", 0.02), ("south", 0.05)):
+        network = load_network(f"{tmp_path / 'net.toml'}:{region}")
+        _, substances = simulated(network)
+        np.testing.assert_allclose(substances[:, 0], np.array([[10.0, 4.0]] * 2) * part, rtol=1e-9)
+    only = import_flows(path, tmp_path / "south.toml", roles=ROLES, stores=["Use"], regions=["South"])
+    assert only.table.substances is not None
+    assert only.table.substances.amounts[0, 0, 0].tolist() == pytest.approx([0.5, 0.2])
+
+
+def test_a_small_reconciliation_by_hand(tmp_path: Path) -> None:
+    """Of 4.4 kt that enter and 1 + 3 that leave, with 10 % each: Lagrange's multiplier is 0.4/Σσ²."""
+    report = imported(tmp_path, sorting((4.4, 1, 3)), reconcile=True)
+    assert report.table.substances is not None
+    variances = np.array([0.44, 0.1, 0.3]) ** 2
+    price = 0.4 / variances.sum()
+    closest = np.array([4.4, 1, 3]) + np.array([-1, 1, 1]) * price * variances
+    np.testing.assert_allclose(report.table.substances.amounts[0, 0, 0], closest, rtol=1e-9)
+    assert report.reconciliation is not None and report.reconciliation.degrees == 2
+    assert report.reconciliation.chi_square == pytest.approx(0.4**2 / variances.sum(), rel=1e-9)
+    assert {change.substance for change in report.changes} == {"Copper"}
+    with (tmp_path / "net_changes.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert {line["substance"] for line in lines} == {"Copper"} and len(lines) == 3
+
+
+def test_contents_of_flows_that_are_adjusted_stay(tmp_path: Path) -> None:
+    """Where a part was measured it is of the adjusted flow; amounts stay what they were."""
+    rows = sorting((4, 10 / 9, 30), "%")
+    rows[0][4] = 110
+    report = imported(tmp_path, rows, reconcile=True)
+    assert report.table.substances is not None
+    flows = report.table.grid(report.table.values)[0, 0]
+    variances = (0.1 * np.array([110.0, 90.0, 10.0])) ** 2
+    np.testing.assert_allclose(
+        flows, np.array([110, 90, 10]) + 10 / variances.sum() * variances * np.array([-1, 1, 1]), rtol=1e-9
+    )
+    measured = flows * np.array([0.04, 1 / 90, 0.3])
+    spread = (0.1 * measured) ** 2
+    gap = measured[0] - measured[1:].sum()
+    expected = measured + gap / spread.sum() * spread * np.array([-1, 1, 1])
+    np.testing.assert_allclose(report.table.substances.amounts[0, 0, 0], expected, rtol=1e-9)
+
+
+def random_measurements(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return true amounts of two substances, measured ones, deviations, flows and balances of a random chain."""
+    rng = np.random.default_rng(seed)
+    flows, substances = simulated(cascade(seed, years=1))
+    flow, true = flows[0], substances[0]
+    balances = np.zeros((3, len(flow)))
+    for k, arc in enumerate(cascade(seed, years=1).arcs):
+        for end, sign in ((arc.donor, -1.0), (arc.recipient, 1.0)):
+            if end.startswith("process"):
+                balances[int(end[-1]), k] += sign
+    deviations = true * rng.uniform(0.05, 0.5, true.shape) + 1e-3
+    measured = np.maximum(true + deviations * rng.normal(size=true.shape), 0.0)
+    return true, measured, deviations, flow, balances
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_amounts_are_the_closest_that_balance_within_flows(seed: int) -> None:
+    """They balance, are no more than the flow, and no other solution that a general solver finds is closer."""
+    true, measured, deviations, flow, balances = random_measurements(seed)
+    flow = np.maximum(true.sum(axis=0) * (1 + 1e-6), flow * np.random.default_rng(seed).uniform(0.2, 1.0))
+    flow[balances.any(axis=0)] = np.maximum(flow, true.sum(axis=0))[balances.any(axis=0)]
+    closest = closest_amounts(measured, deviations, flow, balances)
+    assert closest is not None
+    np.testing.assert_allclose(balances @ closest.T, 0.0, atol=1e-8 * flow.max())
+    assert closest.min() >= 0.0 and (closest.sum(axis=0) <= flow + 1e-8 * flow.max()).all()
+    distance = (((closest - measured) / deviations) ** 2).sum()
+    assert distance <= (((true - measured) / deviations) ** 2).sum() + 1e-6
+    shape = measured.shape
+    other = minimize(
+        lambda x: (((x.reshape(shape) - measured) / deviations) ** 2).sum(),
+        true.ravel(),
+        jac=lambda x: (2 * (x.reshape(shape) - measured) / deviations**2).ravel(),
+        bounds=[(0, None)] * measured.size,
+        constraints=[
+            {"type": "eq", "fun": lambda x: (balances @ x.reshape(shape).T).ravel()},
+            {"type": "ineq", "fun": lambda x: flow - x.reshape(shape).sum(axis=0)},
+        ],
+        method="SLSQP",
+        options={"maxiter": 500, "ftol": 1e-12},
+    )
+    feasible = np.abs(balances @ other.x.reshape(shape).T).max() < 1e-7
+    assert not feasible or distance <= other.fun * (1 + 1e-5) + 1e-5
+
+
+@pytest.mark.slow
+def test_reconciled_amounts_are_nearer_to_the_truth() -> None:
+    """Of measurements that err as stated the sum of squares falls by the degrees of freedom of the balances."""
+    gains, distances = [], []
+    for seed in range(200):
+        true, measured, deviations, flow, balances = random_measurements(seed)
+        deviations = 0.02 * true + 1e-9
+        measured = true + deviations * np.random.default_rng(seed + 1000).normal(size=true.shape)
+        closest = closest_amounts(measured, deviations, flow, balances)
+        assert closest is not None
+        distances.append((((closest - measured) / deviations) ** 2).sum())
+        gains.append((((measured - true) / deviations) ** 2).sum() - (((closest - true) / deviations) ** 2).sum())
+    assert np.mean(distances) == pytest.approx(6.0, rel=0.15)  # three balances of two substances
+    np.testing.assert_allclose(gains, distances, rtol=1e-6, atol=1e-6)  # by Pythagoras, as no limit binds
+
+
+def test_more_than_the_flow_is_brought_within_it(tmp_path: Path) -> None:
+    """The dump of 10 kt takes no more than that of copper, however much is measured."""
+    report = imported(tmp_path, sorting((14, 2, 13)), reconcile=True)
+    assert report.table.substances is not None
+    amounts = report.table.substances.amounts[0, 0, 0]
+    assert amounts[2] == pytest.approx(10.0, rel=1e-9)
+    assert amounts[0] == pytest.approx(amounts[1] + amounts[2], rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("rows", "options", "message"),
+    [
+        (sorting((4, 1, 2)), {}, r"'Sorter' \(2000, Copper\): 4 enter, 3 leave"),
+        (sorting((12, 1, 11)), {}, r"'Sorter' to 'Dump' \(2000\): 11 Copper in 10 kt/year: no more than all of it"),
+        (
+            [*sorting(), ["Mine", "Dump", 2000, "Copper", 1, "%", ""]],
+            {},
+            "line 8: Copper of 'Mine' to 'Dump' in 2000: there is no such flow",
+        ),
+        ([*sorting(), sorting()[3]], {}, "line 8: Copper of 'Mine' to 'Sorter' in 2000 stands in line 5 too"),
+        (
+            sorting(unit="GJ"),
+            {},
+            "line 5: unit 'GJ'.*of a substance give a part, as in % or ppm, or an amount in kt/year",
+        ),
+        (
+            [*sorting((4, 1, 3))[:4], *([*row[:6], "0"] for row in sorting((4, 1, 2))[4:])],
+            {"reconcile": True},
+            None,
+        ),
+        (
+            [*sorting()[:3], *([*row[:6], "0"] for row in sorting((4, 1, 2))[3:])],
+            {"reconcile": True},
+            "2000: no amounts of Copper balance within the flows; state how uncertain they are",
+        ),
+    ],
+)
+def test_bad_tables_are_refused(rows: list[Row], options: dict[str, bool], message: str | None, tmp_path: Path) -> None:
+    """With the line, or what does not balance, and nothing is written."""
+    if message is None:
+        imported(tmp_path, rows, **options)
+        return
+    with pytest.raises(CirlError, match="(?s)" + message):
+        imported(tmp_path, rows, **options)
+    assert not (tmp_path / "net.toml").exists()
+
+
+def test_the_command_says_what_is_in_it(tmp_path: Path) -> None:
+    """How far contents are from the table, and which were adjusted."""
+    path = table(tmp_path / "flows.csv", sorting((4.4, 1, 3)))
+    arguments = ["import", str(path), "--out", str(tmp_path / "net.toml"), "--reservoir", "Mine", "--reconcile"]
+    result = CliRunner().invoke(app, [*arguments, "--landfill", "Dump", "--landfill", "Product"])
+    assert result.exit_code == 0, result.output
+    assert "'Mine' to 'Sorter' (2000, Copper): 4.4 →" in result.output
+    assert "of Copper no flow is further than" in result.output
