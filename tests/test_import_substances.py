@@ -28,7 +28,7 @@ from cirl_marl import (
 )
 from cirl_marl.cli import app
 from cirl_marl.importing.assembly import ImportReport, import_flows
-from cirl_marl.importing.substance_flows import closest_amounts
+from cirl_marl.importing.substance_flows import closest_amounts, degrees_of_freedom
 
 HEADER = ["source", "target", "year", "substance", "value", "unit", "uncertainty"]
 ROLES = {"nonrenewable_reservoir": ["Mine*"], "landfill": ["[DP]*[pt]"]}
@@ -246,6 +246,61 @@ def test_contents_of_flows_that_are_adjusted_stay(tmp_path: Path) -> None:
     gap = measured[0] - measured[1:].sum()
     expected = measured + gap / spread.sum() * spread * np.array([-1, 1, 1])
     np.testing.assert_allclose(report.table.substances.amounts[0, 0, 0], expected, rtol=1e-9)
+
+
+def test_amounts_stay_where_flows_are_adjusted(tmp_path: Path) -> None:
+    """An amount that balances is as it was measured, whatever becomes of the flow that it is in."""
+    rows = sorting((4, 1, 3))
+    rows[0][4] = 110
+    report = imported(tmp_path, rows, reconcile=True)
+    assert report.table.substances is not None
+    np.testing.assert_allclose(report.table.substances.amounts[0, 0, 0], [4, 1, 3], rtol=1e-12)
+
+
+def test_amounts_without_uncertainty_err_by_a_tenth(tmp_path: Path) -> None:
+    """As flows do: χ² is that of 10 % deviations."""
+    rows = [[*row[:6], ""] if row[3] else row for row in sorting((4.4, 1, 3))]
+    report = imported(tmp_path, rows, reconcile=True)
+    assert report.reconciliation is not None
+    assert report.reconciliation.chi_square == pytest.approx(0.4**2 / (0.44**2 + 0.1**2 + 0.3**2), rel=1e-9)
+
+
+def test_degrees_are_those_of_uncertain_amounts() -> None:
+    """A balance of amounts that are known says nothing of the others; nor does one that follows from others."""
+    balances = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 1.0, -1.0, 0.0], [1.0, 0.0, -1.0, 0.0]])
+    assert degrees_of_freedom(np.array([[1.0, 1.0, 1.0, 0.0]]), balances) == 2
+    assert degrees_of_freedom(np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 0.0]]), balances) == 1
+
+
+@pytest.mark.parametrize(
+    ("amounts", "deviations"),
+    [((4.0, 0.4, 3.6), (0.0, 1.0, 1.0)), ((4.0, 0.4, 3.6), (1e-9, 0.0, 0.0)), ((4.0, 0.0, 4.0), (0.0, 0.0, 0.0))],
+)
+def test_what_no_flow_can_hold_is_told(amounts: tuple[float, ...], deviations: tuple[float, ...]) -> None:
+    """Of 4 t that enter for sure no more than 3 and 0.5 t can leave; nor are 3.6 t in a flow of 3."""
+    balances, flow = np.array([[1.0, -1.0, -1.0]]), np.array([100.0, 0.5, 3.0])
+    assert closest_amounts(np.array([amounts]), np.array([deviations]), flow, balances) is None
+
+
+def test_pure_substances_and_flows_of_nothing(tmp_path: Path) -> None:
+    """What is a substance alone is shared out as it was; a year without a flow has the content of another one."""
+    rows: list[Row] = []
+    for y, (dumped, part) in enumerate(((1.0, 1.0), (0.0, 1.0))):
+        for ends, flow in (
+            (("Mine", "Sorter"), 10.0),
+            (("Sorter", "Product"), 10.0 - dumped),
+            (("Sorter", "Dump"), dumped),
+        ):
+            rows.append([*ends, 2000 + y, "", flow, "kt/year", ""])
+            if flow:
+                rows.append([*ends, 2000 + y, "Copper", 100 * part, "%", ""])
+    assert imported(tmp_path, rows).content_error < 1e-9
+
+
+def test_traces_that_do_not_balance_are_told(tmp_path: Path) -> None:
+    """Rounding is a part of what there is of the substance, not of the flow."""
+    with pytest.raises(CirlError, match=r"'Sorter' \(2000, Copper\): 4e-06 enter, 3e-06 leave"):
+        imported(tmp_path, sorting((4e-6, 1e-6, 2e-6)))
 
 
 def random_measurements(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

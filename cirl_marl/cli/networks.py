@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cirl_marl.cli import common
-from cirl_marl.errors import CirlError
+from cirl_marl.errors import CirlError, unknown_name
 
 if TYPE_CHECKING:
     from cirl_marl.learners.recipe import Recipe
@@ -90,12 +90,16 @@ def show(
     unfold: Annotated[
         list[str] | None, typer.Option(help="A copy that is not shown as one box, such as japan in steel_world.")
     ] = None,
+    substance: Annotated[
+        str | None, typer.Option(help="Colour the picture by the content of a substance, such as copper.")
+    ] = None,
 ) -> None:
     """Show the compartments, flows and circularity of a network at its start state, and draw it."""
     import numpy as np
 
     from cirl_marl.controllers.rollout import episode_start
     from cirl_marl.definitions.catalogue import load_network
+    from cirl_marl.drawing.content_colours import SubstanceAmounts
     from cirl_marl.drawing.digraph import save_network
     from cirl_marl.drawing.folding import fold_copies
     from cirl_marl.environments.vector import MultiAgentVectorEnv
@@ -104,6 +108,9 @@ def show(
 
     definition = load_network(network, scenario=scenario)
     env = MultiAgentVectorEnv(definition, num_envs=1)
+    names = [part.id for part in definition.substances]
+    if substance is not None and substance not in names:
+        raise CirlError(f"--substance: {unknown_name('substance', substance, names)}")
     start = episode_start(env, seed)
     start.reset(env)
     stock, flow = env.rows.stocks(env.physical.stock)[:, 0], env.physical.flow[:, 0]
@@ -124,8 +131,21 @@ def show(
     path = picture or Path(f"{common.stem(definition)}.png")
     if path.suffix != ".png":
         raise CirlError(f"--picture {path}: needs the name of a .png file")
+    colours = None
+    if substance is not None:
+        place = names.index(substance)
+        stocks, flows = env.rows.substances(env.physical.stock), env.physical.substances
+        parts = (table.reshape(len(names), -1)[place] for table in (stocks, flows))
+        colours = SubstanceAmounts(substance.replace("_", " "), *parts)
     save_network(
-        path, definition, stock, flow, title=definition.title, circularity=circularity, open_copies=unfold or ()
+        path,
+        definition,
+        stock,
+        flow,
+        title=definition.title,
+        circularity=circularity,
+        open_copies=unfold or (),
+        substance=colours,
     )
     common.console.print(f"picture: {path}")
 

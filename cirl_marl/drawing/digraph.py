@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from cirl_marl.drawing.content_colours import SubstanceAmounts
 from cirl_marl.drawing.folding import fold_copies
 from cirl_marl.drawing.picture import draw_network, largest_flow, legend_of
 from cirl_marl.drawing.style import number, readable, save
@@ -105,16 +107,22 @@ def save_network(
     title: str = "",
     circularity: float | None = None,
     open_copies: Collection[str] = (),
+    substance: SubstanceAmounts | None = None,
 ) -> Path:
     """Save the digraph with its stocks and flows as a PNG, 1800 pixels wide, and return its path.
 
     Its folder is made; without a title it has that of the network. Copies are folded, but for ``open_copies``. For the
     other arguments see ``draw_network``.
     """
+    if substance is not None:
+        stock, flow = np.stack([stock, substance.stock], axis=1), np.stack([flow, substance.flow], axis=1)
     network, stock, flow = fold_copies(network, stock, flow, open_copies)
+    if substance is not None:
+        substance = replace(substance, stock=stock[:, 1], flow=flow[:, 1])
+        stock, flow = stock[:, 0], flow[:, 0]
     figure = Figure(figsize=FRAME_INCHES)
     axes = figure.add_axes((0.01, 0.01, 0.98, 0.87))
-    draw_network(axes, network, stock, flow, title=title, circularity=circularity)
+    draw_network(axes, network, stock, flow, title=title, circularity=circularity, substance=substance)
     return save(figure, path)
 
 

@@ -35,8 +35,8 @@ def fold_copies(
 
     Args:
         network: the network.
-        stock: stocks, shape (stores,), mass.
-        flow: flows, shape (arcs,), mass/time.
+        stock: stocks, shape (stores,), mass; or (stores, n), of all and of substances.
+        flow: flows, shape (arcs,), mass/time, likewise.
         open_copies: copies that are shown as they are.
 
     Raises:
@@ -50,25 +50,27 @@ def fold_copies(
     regions = {node: region for region, nodes in network.copies.items() for node in nodes if region not in open_copies}
     box_of = {node.id: _box(node, regions.get(node.id), network) for node in network.nodes}
     boxes = {box.id: box for box in box_of.values()}
-    box_stocks, scales = dict.fromkeys(boxes, 0.0), dict.fromkeys(boxes, 0.0)
-    for node, amount in zip(network.stores, stock.tolist(), strict=True):
+    box_stocks = {id_: np.zeros(stock.shape[1:]) for id_ in boxes}
+    scales = dict.fromkeys(boxes, 0.0)
+    for node, amount in zip(network.stores, stock, strict=True):
         box_stocks[box_of[node.id].id] += amount
         scales[box_of[node.id].id] += node.scale  # reference stocks add up as stocks do
     nodes = tuple(replace(box, scale=scales[box.id] or box.scale) for box in boxes.values())
-    flows: dict[tuple[str, str], float] = {}
-    visible: list[tuple[Arc, float]] = []
-    for arc, value in zip(network.arcs, flow.tolist(), strict=True):
+    flows: dict[tuple[str, str], Floats] = {}
+    visible: list[tuple[Arc, Floats]] = []
+    for arc, value in zip(network.arcs, flow, strict=True):
         ends = box_of[arc.donor].id, box_of[arc.recipient].id
         if ends == (arc.donor, arc.recipient):
             visible.append((arc, value))
-        elif ends[0] != ends[1] and value != 0:
-            flows[ends] = flows.get(ends, 0.0) + value
+        elif ends[0] != ends[1] and np.any(value != 0):
+            flows[ends] = flows.get(ends, np.zeros(flow.shape[1:])) + value
     arcs = [Arc(id=f"{a}_to_{b}", donor=a, recipient=b, law=Law.SHARE) for a, b in flows]
     fields = {name: getattr(network, name) for name in network.__dataclass_fields__}
     fields |= {"nodes": nodes, "arcs": (*(arc for arc, _ in visible), *arcs), "services": (), "copies": {}}
     folded_network = FoldedNetwork(**fields)
-    stocks = np.array([box_stocks[node.id] for node in folded_network.stores])
-    return folded_network, stocks, np.array([*(value for _, value in visible), *flows.values()])
+    stocks = np.array([box_stocks[node.id] for node in folded_network.stores]).reshape(-1, *stock.shape[1:])
+    values = np.array([*(value for _, value in visible), *flows.values()])
+    return folded_network, stocks, values.reshape(-1, *flow.shape[1:])
 
 
 def _box(node: Node, region: str | None, network: Network) -> Node:
