@@ -142,6 +142,25 @@ def test_the_slider_moves_flows_to_the_numbers_of_the_csv(tmp_path: Path, opened
         np.testing.assert_allclose([float(r["value"]) for r in acts], each.rollout.controls[:, 1], rtol=1e-5)
 
 
+def test_colours_show_contents(tmp_path: Path, opened: Any) -> None:
+    """Where one is chosen: legend, boxes, ribbons and what is said of them; else colours are those of roles."""
+    simulations = simulate_alternatives("examples/copper_in_steel.toml", controls=["neutral"], steps=3)
+    page = opened(write_page(tmp_path / "steel.html", page_of_alternatives(simulations))).page
+    colours = "all => all.map(e => getComputedStyle(e).stroke)"
+    own = page.eval_on_selector_all(".ribbon .line", colours)
+    page.select_option("#tint", "copper")
+    assert len(set(page.eval_on_selector_all(".ribbon .line", colours))) > len(set(own))
+    steps = page.locator("#legend li").all_text_contents()
+    assert steps == ["copper: 0 %", "0.1 %", "0.2 %", "0.3 %", "0.4 % or more", "nothing"]
+    wires = page.locator(".box", has_text="wires")
+    assert ", copper 100\u00a0%" in wires.get_attribute("aria-label")
+    wires.focus()
+    assert page.locator("#details td[data-column='copper']").all_text_contents() == ["100\u00a0%"]
+    page.select_option("#tint", "")
+    assert page.eval_on_selector_all(".ribbon .line", colours) == own
+    assert "copper" not in wires.get_attribute("aria-label")
+
+
 def test_hostile_texts_are_texts(tmp_path: Path, opened: Any) -> None:
     """Titles and sources that would run, end an element or compute in a spreadsheet stand there as they are."""
     tab = opened(write_page(tmp_path / "page.html", page_of_alternatives(two(tmp_path, hostile=True))))

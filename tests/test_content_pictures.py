@@ -19,6 +19,9 @@ from cirl_marl.drawing.digraph import save_network
 from cirl_marl.drawing.folding import fold_copies
 from cirl_marl.drawing.picture import draw_network
 from cirl_marl.drawing.style import NEUTRAL, ROLE_COLOURS
+from cirl_marl.evaluation.simulations import simulate_alternatives
+from cirl_marl.report.page_data import page_data
+from cirl_marl.report.report_page import page_of_alternatives
 
 EXAMPLE = "examples/copper_in_steel.toml"
 
@@ -92,3 +95,18 @@ def test_the_command_colours_by_a_substance(tmp_path: Path) -> None:
     wrong = CliRunner().invoke(app, [*arguments, "cooper"])
     assert wrong.exit_code != 0
     assert "unknown substance 'cooper'. Did you mean 'copper'" in str(wrong.exception)
+
+
+def test_pages_have_contents_and_their_colours() -> None:
+    """Of every node and flow in every interval, on one scale for all episodes; without substances there are none."""
+    simulations = simulate_alternatives(EXAMPLE, controls=["neutral", "random"], steps=3)
+    data = page_data(page_of_alternatives(simulations))
+    (network,) = data["networks"]
+    (copper,) = network["substances"]
+    assert copper["id"] == "copper" and copper["highest"] == pytest.approx(0.004)
+    assert [colour for colour, _ in copper["steps"]] == list(STOPS)
+    for scene, simulation in zip(data["scenes"], simulations, strict=True):
+        (rows,) = scene["contents"]
+        np.testing.assert_allclose(np.array(rows).T, simulation.rollout.contents[:, 0], rtol=1e-5)
+    plain = page_data(page_of_alternatives(simulate_alternatives("copper_net", controls=["neutral"], steps=2)))
+    assert plain["networks"][0]["substances"] == [] and plain["scenes"][0]["contents"] == []

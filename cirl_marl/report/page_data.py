@@ -12,9 +12,10 @@ import numpy as np
 from cirl_marl.controllers.rollout import interval_ends
 from cirl_marl.definitions.sources import StatedNumber, stated_numbers
 from cirl_marl.definitions.writer import fingerprint
+from cirl_marl.drawing.content_colours import ContentColours
 from cirl_marl.drawing.flow_diagram import LETTERS, FlowDiagram, flow_diagrams
 from cirl_marl.drawing.layered import RibbonRoute
-from cirl_marl.drawing.style import label_lines
+from cirl_marl.drawing.style import label_lines, readable
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.statistics import Aggregate
 from cirl_marl.network import Floats, Network
@@ -137,9 +138,21 @@ def _network(network: Network, episodes: Sequence[PageEpisode]) -> Values:
             {"id": part.id, "label": part.title or part.id.replace("_", " "), "unit": part.unit}
             for part in network.accounts
         ],
+        "substances": [_substance(network, i, episodes) for i in range(len(network.substances))],
         "settings": controls,
         "sketches": [_diagram(diagram) for diagram in flow_diagrams(network, peaks)],
     }
+
+
+def _substance(network: Network, place: int, episodes: Sequence[PageEpisode]) -> Values:
+    """Return a substance with the scale of its colours, that of all episodes together."""
+    id_, nodes = network.substances[place].id, len(network.nodes)
+    shown = [(episode.flow, episode.contents[:, place, nodes:]) for episode in episodes if episode.contents is not None]
+    flow = np.concatenate([flow.ravel() for flow, _ in shown] or [np.empty(0)])
+    contents = np.where(flow == 0, np.nan, np.concatenate([parts.ravel() for _, parts in shown] or [np.empty(0)]))
+    colours = ContentColours(readable(id_), contents, flow)
+    steps = [[colour, text] for colour, text in colours.steps.items()]
+    return {"id": id_, "label": readable(id_), "highest": _number(colours.highest), "steps": steps}
 
 
 def _law(network: Network, arc: Arc) -> str:
@@ -178,9 +191,15 @@ def _episode(episode: PageEpisode, network: int) -> Values:
         "services": [_band(level) for level in episode.levels],
         "disturbances": [_band(values) for values in episode.disturbances],
         "accounts": [_band(values) for values in episode.accounts],
+        "contents": [] if episode.contents is None else [_rows(part) for part in episode.contents.swapaxes(0, 1)],
         "about": episode.about,
         "figures": {name: _aggregate(figure) for name, figure in episode.figures.items() if figure is not None},
     }
+
+
+def _rows(table: Floats) -> list[list[float | None]]:
+    """Return a list for each compartment of a table of shape (steps, compartments)."""
+    return [_list(row) for row in table.T]
 
 
 def _diagram(diagram: FlowDiagram) -> Values:

@@ -20,8 +20,8 @@ from cirl_marl.report.page_data import page_data
 from cirl_marl.report.report_page import ReportPage
 
 SCRIPTS = (
-    "elements", "figures", "clock", "ribbons", "diagram", "curves", "plane", "details", "agents", "reasons", "tables",
-    "main",
+    "elements", "figures", "clock", "ribbons", "contents", "diagram", "curves", "plane", "details", "agents", "reasons",
+    "tables", "main",
 )  # fmt: skip
 """Modules of the page, each behind those from which it imports."""
 

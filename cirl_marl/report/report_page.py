@@ -63,6 +63,9 @@ class PageEpisode:
     )
     disturbances: Annotated[tuple[Band, ...], "values of each disturbance"] = ()
     accounts: Annotated[tuple[Band, ...], "amount on each account in each interval"] = ()
+    contents: Annotated[
+        Floats | None, "of each substance in nodes and flows, shape (steps, substances, compartments); None: not known"
+    ] = None
 
 
 @positional_record
@@ -253,6 +256,7 @@ def _episode(
         figures=figures,
         disturbances=tuple(_mean(values, np.inf) for values in np.moveaxis(outcome.disturbances, 2, 0)),
         accounts=tuple(_mean(values, np.inf) for values in np.moveaxis(outcome.bookings, 1, 0)),
+        contents=outcome.contents,
     )
 
 

@@ -1,6 +1,7 @@
 // What is pointed at, focused or chosen: value, unit, share and source, in every scene.
 
 import { amounts, nameOf, signOf } from "./diagram.js";
+import { content, contentsOf } from "./contents.js";
 import { make, part, tableOf } from "./elements.js";
 import { figure, measured, percent } from "./figures.js";
 import { swatch } from "./curves.js";
@@ -40,6 +41,16 @@ function headed({ scene, ink }) {
   return make("span", {}, swatch(ink), ` ${scene.name}`);
 }
 
+/** The contents of all substances in a box or ribbon, as cells of a table. */
+function contentCells(story, scene, sketch, step, kind, place) {
+  if (!scene.contents.length) return [];
+  return story.networks[scene.network].substances.map(({ id }) => content(contentsOf(story, scene, sketch, step, id)[kind][place]));
+}
+
+function contentHeads(story, network, scenes) {
+  return scenes.some(({ scene }) => scene.contents.length) ? story.networks[network].substances.map(({ label }) => label) : [];
+}
+
 function boxDetail(story, network, sketch, place, step, scenes) {
   const box = sketch.boxes[place];
   const flow = `${story.mass}/${story.time}`;
@@ -48,11 +59,11 @@ function boxDetail(story, network, sketch, place, step, scenes) {
   const rows = scenes.map(({ scene, ink }) => {
     const now = amounts(story, scene, sketch, step);
     const held = box.stores ? [measured(now.boxes[place].held, story.mass), percent(now.boxes[place].full)] : [];
-    return [headed({ scene, ink }), ...held, measured(through(into, now.ribbons), flow), measured(through(out, now.ribbons), flow)];
+    return [headed({ scene, ink }), ...held, measured(through(into, now.ribbons), flow), measured(through(out, now.ribbons), flow), ...contentCells(story, scene, sketch, step, "boxes", place)];
   });
   const kind = box.opens ? `${box.members.length} stocks of a group` : `${ROLES[box.role]}${box.stores ? "" : ", stores nothing"}`;
   const node = box.members.length === 1 && !box.opens ? story.networks[network].nodes[box.members[0]] : null;
-  const header = ["", ...(box.stores ? ["holds at the end", "full"] : []), "enters", "leaves"];
+  const header = ["", ...(box.stores ? ["holds at the end", "full"] : []), "enters", "leaves", ...contentHeads(story, network, scenes)];
   return { about: `${kind[0].toUpperCase()}${kind.slice(1)}.`, header, rows, told: node?.told ?? [] };
 }
 
@@ -66,10 +77,10 @@ function ribbonDetail(story, network, sketch, place, step, scenes) {
   const rows = scenes.map(({ scene, ink }) => {
     const { ribbons } = amounts(story, scene, sketch, step);
     const total = ribbon.members.reduce((sum, k) => sum + scene.flows[k].reduce((all, value) => all + (value ?? 0), 0), 0);
-    const values = [measured(ribbons[place], flow), share(ribbons, "donor"), share(ribbons, "recipient"), figure(total * story.interval)];
+    const values = [measured(ribbons[place], flow), share(ribbons, "donor"), share(ribbons, "recipient"), figure(total * story.interval), ...contentCells(story, scene, sketch, step, "ribbons", place)];
     return [headed({ scene, ink }), ...values];
   });
-  const header = ["", "flow", "of what leaves", "of what arrives", `in all / ${story.mass}`];
+  const header = ["", "flow", "of what leaves", "of what arrives", `in all / ${story.mass}`, ...contentHeads(story, network, scenes)];
   const arc = ribbon.members.length === 1 ? story.networks[network].arcs[ribbon.members[0]] : null;
   const effect = EFFECTS[signOf(story.networks[network], ribbon)];
   return { about: [effect, arc ? `${arc.law}.` : ""].filter(Boolean).join(" "), header, rows, told: arc?.told ?? [] };

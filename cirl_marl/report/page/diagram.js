@@ -1,5 +1,6 @@
 // The network: boxes with levels, ribbons as wide as their flows, loops as loops. One diagram shows one scene.
 
+import { colourOf, content, contentsOf, substanceOf } from "./contents.js";
 import { draw, make } from "./elements.js";
 import { figure, measured } from "./figures.js";
 import { endsOf, frameOf, headOf, labelAt, lineOf } from "./ribbons.js";
@@ -196,7 +197,22 @@ export function diagramOf(host, story, scene, sketch, told) {
     going = window.requestAnimationFrame(frames);
   }
 
-  function update(step) {
+  /** Gives boxes and ribbons the colours of the contents of a substance, or their own; returns what to say of each. */
+  function tint(step, id) {
+    const substance = substanceOf(network, id);
+    const found = substance ? contentsOf(story, scene, sketch, step, id) : null;
+    const say = (part) => (substance ? `, ${substance.label} ${content(part)}` : "");
+    for (const [kind, name] of [["boxes", "--b"], ["ribbons", "--r"]]) {
+      parts[kind].forEach(({ item }, i) => {
+        if (found) item.style.setProperty(name, colourOf(substance, found[kind][i]));
+        else item.style.removeProperty(name);
+      });
+    }
+    return { box: (b) => say(found?.boxes[b]), ribbon: (k) => say(found?.ribbons[k]) };
+  }
+
+  function update(step, id) {
+    const said = tint(step, id);
     const now = amounts(story, scene, sketch, step);
     parts.boxes.forEach(({ level, amount, area, item }, b) => {
       const box = sketch.boxes[b];
@@ -206,11 +222,11 @@ export function diagramOf(host, story, scene, sketch, told) {
       amount.textContent = now.boxes[b].held === null ? "" : figure(now.boxes[b].held);
       const opens = box.opens ? ", a group: Enter opens it" : "";
       const what = `${box.stores ? "holds" : "passes on"} ${measured(now.boxes[b].held, units[box.stores])}`;
-      item.setAttribute("aria-label", `${nameOf(network, sketch, "box", b)}, ${what}${opens}`);
+      item.setAttribute("aria-label", `${nameOf(network, sketch, "box", b)}, ${what}${said.box(b)}${opens}`);
     });
     parts.ribbons.forEach(({ item }, k) => {
       const name = nameOf(network, sketch, "ribbon", k);
-      item.setAttribute("aria-label", `${name}, ${measured(now.ribbons[k], units.false)}`);
+      item.setAttribute("aria-label", `${name}, ${measured(now.ribbons[k], units.false)}${said.ribbon(k)}`);
       item.setAttribute("data-flow", now.ribbons[k]);
     });
     glide(now.ribbons);

@@ -2,6 +2,7 @@
 
 import { agentsOf } from "./agents.js";
 import { clockOf } from "./clock.js";
+import { choiceOf, stepsOf, substanceOf } from "./contents.js";
 import { panelOf, swatch } from "./curves.js";
 import { detail, hint } from "./details.js";
 import { diagramOf, LEAST } from "./diagram.js";
@@ -14,7 +15,7 @@ import { figuresOf, outcomeOf } from "./tables.js";
 
 const BESIDE = 4;
 const story = JSON.parse(part("data").textContent);
-const state = { scene: Math.min(1, story.scenes.length - 1), beside: false, group: "", step: 1, chosen: null };
+const state = { scene: Math.min(1, story.scenes.length - 1), beside: false, group: "", step: 1, chosen: null, substance: "" };
 let diagrams = [];
 let panels = [];
 let redraws = [];
@@ -65,7 +66,7 @@ function stages() {
 function build() {
   for (const each of diagrams) {
     each.drawn.build(each.host.clientWidth);
-    each.drawn.update(state.step);
+    each.drawn.update(state.step, state.substance);
     mark(each);
   }
 }
@@ -133,13 +134,13 @@ function legend() {
   const effects = { "-1": ["lowers", "flow that lowers λ"], 1: ["raises", "flow that raises λ"], 0: ["other", "other flow"] };
   const most = Math.max(0, ...story.scenes.flatMap((scene) => scene.flows.flatMap((flow) => flow.map(Math.abs))));
   const item = (look, name) => make("li", {}, make("i", { class: `key ${look}` }), name);
-  part("legend").append(
-    make(
-      "ul",
-      {},
+  const substance = story.networks.map((network) => substanceOf(network, state.substance)).find(Boolean);
+  const meanings = substance ? stepsOf(substance) : [
       ...Object.entries(effects).filter(([sign]) => arcs.some((arc) => arc.sign === Number(sign))).map(([, [look, name]]) => item(look, name)),
       ...roles.map((role) => item(role, role.replaceAll("_", " ").replace("nonrenewable", "non-renewable"))),
-    ),
+  ];
+  part("legend").replaceChildren(
+    make("ul", {}, ...meanings),
     make("p", {}, `Ribbons are as wide as their flows, in ${story.mass}/${story.time}; the largest is ${measured(most, `${story.mass}/${story.time}`)}. Boxes fill with their stocks, in ${story.mass}: half full is the reference stock.`, nodes.every((node) => node.stores) ? "" : " Dashed boxes store nothing."),
   );
 }
@@ -183,7 +184,7 @@ function curves() {
 function moved(step) {
   state.step = step;
   part("details").setAttribute("aria-live", "off"); // while time moves nobody wants every step read out
-  for (const each of diagrams) each.drawn.update(step);
+  for (const each of diagrams) each.drawn.update(step, state.substance);
   for (const each of panels) each.update(step);
   redraws.forEach((each) => each(step));
   if (state.chosen) detail(story, state.chosen.scene.network, state.chosen.sketch, state.chosen.kind, state.chosen.place, step);
@@ -212,6 +213,11 @@ if (story.scenes.length) {
   shown("network");
   shown("timed");
   who();
+  choiceOf(story, (id) => {
+    state.substance = id;
+    legend();
+    for (const each of diagrams) each.drawn.update(state.step, id);
+  });
   legend();
   hint();
   time = clockOf(story.clock.labels, moved);
