@@ -11,7 +11,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -294,15 +294,26 @@ def with_changing_contents(network: Network, seed: int) -> Network:
         for node in network.nodes
     ]
     recipients = rng.choice([node.id for node in network.nodes], 2)
-    control = Control(kind=ControlKind.FLOW, low=0.0, neutral=5.0, high=float(rng.uniform(5, 50)))
+    order = Control(kind=ControlKind.FLOW, low=0.0, neutral=5.0, high=float(rng.uniform(5, 50)))
+    valve = Control(kind=ControlKind.RATE, low=0.2, neutral=0.7, high=1.3)
+    control = [None, valve, order][int(rng.integers(3))]  # of the source; of its flow if that is no order
+    limit: dict[str, Any] = {"capacity_node": network.stores[0].id, "capacity_rate": 0.5} if rng.random() < 0.3 else {}
     arcs = (
-        Arc(id="quarried", donor="quarry", recipient=str(recipients[0]), law=Law.CONTROLLED, control=control),
+        Arc(
+            id="quarried",
+            donor="quarry",
+            recipient=str(recipients[0]),
+            law=Law.CONTROLLED,
+            control=None if control is order else order,
+            **limit,
+        ),
         Arc(id="dug", donor="quarry", recipient=str(recipients[1]), law=Law.EXOGENOUS, flow=float(rng.uniform(0, 20))),
     )
     quarry = Node(
         id="quarry",
         role=Role.NONRENEWABLE_RESERVOIR,
         content=changing(0.0, length),
+        control=control,
     )
     return replace(network, nodes=(*nodes, quarry), arcs=(*network.arcs, *arcs), scenarios={})
 

@@ -217,6 +217,39 @@ def test_masses_of_networks_with_changing_contents(seed: int, nodes: int, arcs: 
         assert (parts.sum(axis=0) <= rows.stocks(env.physical.stock) * (1 + 1e-12)).all()
 
 
+@given(seed=st.integers(0, 2**32 - 1), nodes=st.integers(2, 6), arcs=st.integers(1, 9), lifetimes=st.booleans())
+def test_random_draws_move_as_their_networks(seed: int, nodes: int, arcs: int, lifetimes: bool) -> None:
+    """A copy whose contents are drawn and disturbed moves as the certain network, below its bound; and as alone."""
+    network = with_substances(random_network(seed, nodes, arcs, lifetimes=lifetimes), seed)
+    if "quarry" not in network.node_index:
+        network = with_changing_contents(network, seed)
+    path = f"nodes.quarry.content.{network.substances[0].id}"
+    spread, noise = Spread(low=0.5, high=1.05, distribution="uniform"), replace(NOISE, high=1.3)
+    network = replace(
+        network.with_options(episode={"horizon": min(network.episode.horizon, 4)}),
+        uncertain={path: spread},
+        disturbances={"noise": noise},
+        disturbed={path: DisturbanceEffect(by="noise")},
+    )
+    env, alone = (MultiAgentVectorEnv(network, num_envs=copies, uncertain=True) for copies in (2, 1))
+    env.reset(seed=seed % 1000)
+    alone.reset(seed=seed % 1000)
+    rng, start = np.random.default_rng(seed), env.physical.stock[env.rows.nodes, 0]
+    certain = MultiAgentVectorEnv(env.certain_network(0), num_envs=1)
+    certain.reset(options={"initial_state": dict(zip(env.rows.start_names, start.tolist(), strict=True))})
+    for _ in range(network.episode.horizon):
+        actions = rng.uniform(-1, 1, (len(env.actuators.control_rows), 1))
+        env.advance(np.repeat(actions, 2, axis=1))
+        alone.advance(actions)
+        certain.advance(actions)
+    np.testing.assert_array_equal(alone.physical.stock[:, 0], env.physical.stock[:, 0])
+    size = start.sum()
+    np.testing.assert_allclose(certain.physical.stock[:, 0], env.physical.stock[:, 0], rtol=1e-8, atol=1e-10 * size)
+    limit = bound(certain.network, start).objective
+    reached = float(env.physical.circularity[0] / network.episode.horizon)
+    assert reached <= limit + 1e-7 * (1.0 + abs(limit))
+
+
 @pytest.mark.parametrize("scarce", [False, True])
 def test_derivatives_by_what_is_unforeseen(scarce: bool) -> None:
     """By draws and disturbances of contents, by actions and starts, also where a component is out."""

@@ -144,7 +144,7 @@ class Network(Specification):
             if node.initial is None and node.history is not None:
                 initial[:, i] = remaining_history(node, self.episode.control_interval).sum()
         without_start = {node.id for node in self.stores if node.initial is None and node.history is None}
-        reserves = {node.id: self._reserve(node).sum() for node in changing_sources(self)}
+        reserves = {id_: reserve.sum() for id_, reserve in self._reserves.items()}
         for arc in self.arcs:
             if arc.donor in without_start and arc.donor not in reserves:
                 demand = self._demand(arc).sum() * self.episode.control_interval
@@ -172,6 +172,10 @@ class Network(Specification):
         ]
         return np.asarray(np.prod([base, *factors], axis=0))
 
+    @cached_property
+    def _reserves(self) -> Mapping[str, Floats]:
+        return {source.id: self._reserve(source) for source in changing_sources(self)}
+
     def _reserve(self, source: Node) -> Floats:
         """Return the most that can be asked of each component of a changing source, shape (components,), mass."""
         parts = contents(self, source, self.interval_means)
@@ -196,8 +200,8 @@ class Network(Specification):
             masses = [remaining_history(node, interval, content.get(part.id, 0.0)) for part in self.substances]
             whole = remaining_history(node, interval)
             return np.asarray(np.concatenate([np.maximum(whole - sum(masses), 0.0), *masses]) / whole.sum())
-        if node.id in (source.id for source in changing_sources(self)):
-            reserve = self._reserve(node)
+        if node.id in self._reserves:
+            reserve = self._reserves[node.id]
             parts = reserve if reserve.any() else contents(self, node, self.interval_means)[:, 0]
             return np.asarray(parts / parts.sum())
         return np.asarray(np.kron(contents(self, node, lambda content: np.array([content]))[:, 0], ages))

@@ -236,7 +236,8 @@ def _no_content(network: Specification, node: Node, path: str) -> str:
         for id_, part in dict(node.content).items()
     ]
     most = float(np.max(sum(parts)))
-    return f"some draws of its contents sum to {most:.4g}, more than 1; give ranges" if most > 1 + ROUNDING else ""
+    by = f"disturbed by '{network.disturbed[path].by}': " if path in network.disturbed else ""
+    return f"{by}some draws of its contents sum to {most:.4g}, more than 1; give ranges" if most > 1 + ROUNDING else ""
 
 
 def _lost_capacity(network: Specification, part: Any, path: str) -> str:

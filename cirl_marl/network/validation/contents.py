@@ -27,6 +27,9 @@ def substance_problems(network: Specification) -> Iterator[str]:
     for node in network.nodes:
         if node.content:
             yield from _content_problems(network, node, substances)
+    for source in changing_sources(network):
+        if source.stores:
+            yield from _source_problems(network, source)
     for arc in network.arcs:
         yield from _transfer_problems(arc, substances)
     yield from _service_problems(network, substances)
@@ -54,12 +57,11 @@ def _content_problems(network: Specification, node: Node, substances: list[str])
         late = [part for part in series if part.times[0] > node.history.times[0]]
         if late:
             yield f"{subject}: series begins at {late[0].times[0]:g}, after the history at {node.history.times[0]:g}"
-    elif node.stores and node.id in (source.id for source in changing_sources(network)):
-        yield from _source_problems(network, node, subject)
 
 
-def _source_problems(network: Specification, node: Node, subject: str) -> Iterator[str]:
+def _source_problems(network: Specification, node: Node) -> Iterator[str]:
     """Yield why the contents of a stock cannot change in time, whatever flows."""
+    subject = f"node '{node.id}': content"
     remedy = "a stock mixes what enters it; only what a source gives, or what a history was, may change in time"
     for arc in network.arcs:
         if arc.recipient == node.id:
