@@ -18,7 +18,7 @@ from cirl_marl.drawing.content_colours import STOPS, ContentColours, SubstanceAm
 from cirl_marl.drawing.digraph import save_network
 from cirl_marl.drawing.folding import fold_copies
 from cirl_marl.drawing.picture import draw_network
-from cirl_marl.drawing.style import NEUTRAL, ROLE_COLOURS
+from cirl_marl.drawing.style import GOOD, NEUTRAL, ROLE_COLOURS, WARNING
 from cirl_marl.evaluation.simulations import simulate_alternatives
 from cirl_marl.report.page_data import page_data
 from cirl_marl.report.report_page import page_of_alternatives
@@ -59,6 +59,7 @@ def test_boxes_and_arrows_have_the_colours_of_their_contents() -> None:
     assert legend is not None
     texts = [text.get_text() for text in legend.get_texts()]
     assert "copper: 0 %" in texts and "nothing" in texts and "flow that lowers λ" not in texts
+    assert not {WARNING, GOOD} & {text.get_color() for text in axes.texts}
     levels = [to_hex(patch.get_facecolor()) for patch in axes.patches]
     assert colours.of(0.001) in levels and not {*ROLE_COLOURS.values()} & {*levels}
     draw_network(axes, network, stock, flow)
@@ -92,6 +93,19 @@ def test_the_command_colours_by_a_substance(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, [*arguments, "copper"])
     assert plain.exit_code == result.exit_code == 0, result.output
     assert (tmp_path / "steel.png").read_bytes() != before
+    tin = 'content.tin = { value = 50, unit = "%", source = "s" }'
+    scale = '[substances.tin]\nscale = { value = 1, unit = "1", source = "s" }'
+    text = Path(EXAMPLE).read_text().replace("[nodes.flat_steel]", f"{scale}\n\n[nodes.flat_steel]")
+    path = tmp_path / "two.toml"
+    path.write_text(text.replace("[nodes.buildings]", f"{tin}\n\n[nodes.buildings]"))
+    pictures = []
+    for substance in ("copper", "tin"):
+        result = CliRunner().invoke(
+            app, ["show", str(path), "--picture", str(tmp_path / "two.png"), "--substance", substance]
+        )
+        assert result.exit_code == 0, result.output
+        pictures.append((tmp_path / "two.png").read_bytes())
+    assert pictures[0] != pictures[1]
     wrong = CliRunner().invoke(app, [*arguments, "cooper"])
     assert wrong.exit_code != 0
     assert "unknown substance 'cooper'. Did you mean 'copper'" in str(wrong.exception)

@@ -105,6 +105,44 @@ def test_sources_that_give_different_things_become_several(tmp_path: Path) -> No
     }
 
 
+def test_processes_mix_what_the_table_does_not_tell(tmp_path: Path) -> None:
+    """Of which no outflow says anything: shares are enough. A 0 is told, and does not balance."""
+    report = imported(tmp_path, sorting((4, "", "")))
+    assert report.table.substances is not None
+    np.testing.assert_allclose(report.table.substances.amounts[0, 0, 0], [4, 3.6, 0.4], rtol=1e-12)
+    assert "transfer" not in (tmp_path / "net.toml").read_text()
+    with pytest.raises(CirlError, match=r"'Sorter' \(2000, Copper\): 4 enter, 0 leave"):
+        import_flows(table(tmp_path / "0.csv", sorting((4, 0, 0))), tmp_path / "zero.toml", roles=ROLES)
+
+
+def test_mixing_goes_round_loops_and_is_little_trusted(tmp_path: Path) -> None:
+    """What comes back is mixed again; an amount that follows from others gives way to one that was measured."""
+    rows = [*sorting((4, "", "")), ["Works", "Sorter", 2000, "", 20, "kt/year", ""]]
+    rows[1][:2], rows[1][4] = ["Sorter", "Works"], 110.0
+    rows.append(["Works", "Product", 2000, "", 90, "kt/year", ""])
+    report = imported(tmp_path, rows)
+    assert report.table.substances is not None
+    amounts = dict(zip(map(str, report.table.pairs), report.table.substances.amounts[0, 0, 0], strict=True))
+    assert amounts["'Works' to 'Product'"] == pytest.approx(3.6) and amounts["'Sorter' to 'Dump'"] == pytest.approx(0.4)
+    assert amounts["'Works' to 'Sorter'"] == pytest.approx(0.04 * 20)
+    rows.append(["Works", "Product", 2000, "Copper", 3.0, "kt/year", "1 %"])
+    rows.append(["Works", "Sorter", 2000, "Copper", 1.0, "kt/year", "1 %"])
+    again = import_flows(table(tmp_path / "2.csv", rows), tmp_path / "again.toml", roles=ROLES, reconcile=True)
+    assert again.table.substances is not None
+    amounts = dict(zip(map(str, again.table.pairs), again.table.substances.amounts[0, 0, 0], strict=True))
+    assert amounts["'Works' to 'Product'"] == pytest.approx(3.0, rel=0.01)
+    assert amounts["'Sorter' to 'Dump'"] == pytest.approx(0.7, rel=0.05)  # of 0.6 too much half each, by 0.4 and 0.4
+
+
+def test_stores_do_not_hand_on_what_the_table_does_not_tell(tmp_path: Path) -> None:
+    """What leaves a store is not what enters it."""
+    rows: list[Row] = [["Mine", "Use", 2000, s, v, "kt/year", ""] for s, v in (("", 10.0), ("Copper", 0.2))]
+    rows.append(["Use", "Dump", 2000, "", 5.0, "kt/year", ""])
+    report = imported(tmp_path, rows, stores=["Use"])
+    assert report.table.substances is not None
+    assert report.table.substances.amounts[0, 0, 0].tolist() == [0.2, 0.0]
+
+
 def cascade(seed: int, years: int = 4) -> Network:
     """Return a random network of two sources, three processes that separate and two sinks, with contents in time."""
     rng = np.random.default_rng(seed)

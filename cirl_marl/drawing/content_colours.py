@@ -45,7 +45,7 @@ class ContentColours:
 
     def of(self, content: float) -> str:
         """Return the colour of a content; NaN, of nothing, is grey."""
-        return NEUTRAL if np.isnan(content) else _colour(round(min(content / self.highest, 1.0), 3))
+        return NEUTRAL if np.isnan(content) else _colour(round(content / self.highest, 3))
 
     @property
     def steps(self) -> dict[str, str]:
@@ -66,7 +66,7 @@ def contents_of(amounts: Floats, whole: Floats) -> Floats:
 
 @cache
 def _colour(share: float) -> str:
-    """Return the colour at a share of the scale, between its neighbours among ``STOPS``."""
+    """Return the colour at a share of the scale, between its neighbours among ``STOPS``; beyond 1 the last."""
     table = [[int(stop[i : i + 2], 16) for i in (1, 3, 5)] for stop in STOPS]
     places = np.linspace(0.0, 1.0, len(STOPS))
     return "#" + "".join(f"{round(float(np.interp(share, places, row))):02x}" for row in zip(*table, strict=True))

@@ -97,7 +97,9 @@ def import_flows(
     if regions:
         table = table.of(regions)
     known_stocks = {} if stocks is None else read_stocks(stocks, table.unit.rpartition("/")[0])
-    processes = Processes(table, _matching_processes(table, [*stores, *_stock_processes(table, known_stocks)], "store"))
+    holders = _matching_processes(table, [*stores, *_stock_processes(table, known_stocks)], "store")
+    table = Processes(table, holders).mix_substances()
+    processes = Processes(table, holders)
     _check_stores(processes, stores)
     reconciliation: Reconciliation | None = None
     residuals = processes.residuals

@@ -12,7 +12,7 @@ from scipy.special import chdtrc
 
 from cirl_marl.errors import CirlError
 from cirl_marl.importing.flow_table import Connection, FlowTable
-from cirl_marl.importing.substance_flows import closest_amounts, degrees_of_freedom, excesses
+from cirl_marl.importing.substance_flows import closest_amounts, degrees_of_freedom, excesses, mixed_amounts
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record
 
@@ -163,6 +163,26 @@ class Processes:
         regions, years = self._table.regions, self._table.years
         for r, y, i in np.argwhere(wrong).tolist():
             yield Residual(self.names[i], regions[r], years[y], inflow[r, y, i], outflow[r, y, i], substance)
+
+    def mix_substances(self) -> FlowTable:
+        """Return the table with what processes without stock hand on of a substance of which no outflow says anything.
+
+        They mix what enters. These amounts are as uncertain as they are large.
+        """
+        table, substances = self._table, self._table.substances
+        if substances is None:
+            return table
+        amounts, deviations = substances.amounts.copy(), substances.deviations.copy()
+        transit = np.array([kind is ProcessKind.TRANSIT for kind in self.kinds.values()])
+        is_told = np.asarray(np.isfinite(substances.is_content).any(axis=(1, 2)))
+        for e in range(len(substances.names)):
+            tells = (np.maximum(-self._incidence, 0.0) @ is_told[e]) > 0
+            silent = np.flatnonzero(transit & ~tells)
+            leaves = (self._incidence[silent] < 0).any(axis=0)
+            for r, y in np.ndindex(self.flows.shape[:2]):
+                amounts[e, r, y] = mixed_amounts(amounts[e, r, y], self.flows[r, y], self._incidence, silent)
+            deviations[e][..., leaves] = amounts[e][..., leaves]
+        return replace(table, substances=replace(substances, amounts=amounts, deviations=deviations))
 
     def check_contents(self) -> None:
         """Refuse flows in which there is more of substances than they are; a ``CirlError`` names the first."""

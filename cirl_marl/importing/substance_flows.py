@@ -26,7 +26,9 @@ class SubstanceFlows:
     names: Annotated[tuple[str, ...], "in the order of the file"]
     amounts: Annotated[Floats, "shape (substances, regions, years, pairs), mass/time"]
     deviations: Annotated[Floats, "standard deviations, NaN where none is stated, likewise"]
-    is_content: Annotated[Floats, "1 where a part of the flow was stated, 0 where an amount was, likewise"]
+    is_content: Annotated[
+        Floats, "1 where a part of the flow was stated, 0 where an amount was, NaN elsewhere, likewise"
+    ]
 
     def of_flows(self, before: Floats, after: Floats) -> SubstanceFlows:
         """Return the substances of flows that were adjusted, (regions, years, pairs): contents stay what they were."""
@@ -60,8 +62,8 @@ class SubstanceRows:
             CirlError: naming the line of a substance in what does not flow, one that stands twice, or a wrong unit.
         """
         names = tuple(dict.fromkeys(name for name, *_ in self.entries))
-        amounts, is_content = np.zeros((2, len(names), *grid.shape))
-        deviations, lines = np.full_like(amounts, np.nan), np.zeros(amounts.shape, dtype=np.intp)
+        amounts, lines = np.zeros((len(names), *grid.shape)), np.zeros((len(names), *grid.shape), dtype=np.intp)
+        deviations, is_content = np.full((2, *amounts.shape), np.nan)
         for name, line, sheet, text, (region, year, pair), value, deviation in self.entries:
             place = names.index(name), region, year - first_year, pair
             flow, subject = _cell(grid, place[1:]), f"{sheet}, line {line}: {name} of {labels[pair]} in {year}"
@@ -94,6 +96,22 @@ def _scale(subject: str, text: str, unit: str) -> tuple[float, bool]:
         except CirlError as error:
             faults.append(error)
     raise CirlError(f"{subject}: {faults[0]}; of a substance give a part, as in % or ppm, or an amount in {unit}")
+
+
+def mixed_amounts(amounts: Floats, flow: Floats, incidence: Floats, silent: Integers) -> Floats:
+    """Return amounts with what processes hand on that mix: of what enters, x_k = f_k/Σf·Σ_in x, a linear system.
+
+    Args:
+        amounts: of a substance in the flows of a year, 0 where nothing is known, shape (pairs,).
+        flow: in which they are, likewise.
+        incidence: −1 where a pair leaves, 1 where it enters a process, shape (processes, pairs).
+        silent: processes of whose outflows nothing is known.
+    """
+    leaves, enters = np.maximum(-incidence[silent], 0.0), np.maximum(incidence[silent], 0.0)
+    whole = leaves @ flow
+    shares = np.divide(leaves * flow, whole[:, None], out=np.zeros_like(leaves), where=whole[:, None] > 0)
+    through = np.linalg.lstsq(np.eye(len(silent)) - enters @ shares.T, enters @ amounts, rcond=None)[0]
+    return np.asarray(amounts + shares.T @ through)
 
 
 def excesses(amounts: Floats, flows: Floats) -> Iterator[tuple[int, int, int]]:

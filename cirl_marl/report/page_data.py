@@ -149,7 +149,7 @@ def _substance(network: Network, place: int, episodes: Sequence[PageEpisode]) ->
     id_, nodes = network.substances[place].id, len(network.nodes)
     shown = [(episode.flow, episode.contents[:, place, nodes:]) for episode in episodes if episode.contents is not None]
     flow = np.concatenate([flow.ravel() for flow, _ in shown] or [np.empty(0)])
-    contents = np.where(flow == 0, np.nan, np.concatenate([parts.ravel() for _, parts in shown] or [np.empty(0)]))
+    contents = np.concatenate([parts.ravel() for _, parts in shown] or [np.empty(0)])
     colours = ContentColours(readable(id_), contents, flow)
     steps = [[colour, text] for colour, text in colours.steps.items()]
     return {"id": id_, "label": readable(id_), "highest": _number(colours.highest), "steps": steps}
