@@ -455,4 +455,4 @@ def test_the_command_says_what_is_in_it(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, [*arguments, "--landfill", "Dump", "--landfill", "Product"])
     assert result.exit_code == 0, result.output
     assert "'Mine' to 'Sorter' (2000, Copper): 4.4 →" in result.output
-    assert "of Copper no flow is further than" in result.output
+    assert "simulated contents of Copper are up to" in result.output

@@ -82,10 +82,8 @@ def import_(
         which = f"the adjusted table, which is up to {moved:.2g} {table.unit} from the original"
     say(f"simulated without agents, no flow is further than {report.largest_error:.2g} {table.unit} from {which}")
     if table.substances is not None:
-        part = f"{100 * report.content_error:.2g} % of the flow"
-        say(
-            f"of {', '.join(table.substances.names)} no flow is further than {part} from it; stores mix what is in them"
-        )
+        distance = f"up to {100 * report.content_error:.2g} percentage points from the table, as stores mix"
+        say(f"simulated contents of {', '.join(table.substances.names)} are {distance}")
     say(f"wrote {', '.join(map(str, report.files))}")
 
 

@@ -33,13 +33,9 @@ class SourceContents:
         arcs = [arc for arc in network.arcs if arc.donor in place]
         self._source: Integers = np.array([place[arc.donor] for arc in arcs], dtype=np.intp)
         shape = (-1, 1 + len(substances))
-        copies, arc_index, node_index = (
-            staged_network.components_of,
-            staged_network.arc_index,
-            staged_network.node_index,
-        )
-        arc_rows = [arc_index[id_] for arc in arcs for id_ in copies(arc.id)]
-        node_rows = [node_index[id_] for node in sources for id_ in copies(node.id)]
+        copies = staged_network.components_of
+        arc_rows = [staged_network.arc_index[id_] for arc in arcs for id_ in copies(arc.id)]
+        node_rows = [staged_network.node_index[id_] for node in sources for id_ in copies(node.id)]
         self.arcs: Integers = np.array(arc_rows, dtype=np.intp).reshape(shape).T
         self.donors: Integers = np.array(node_rows, dtype=np.intp).reshape(shape).T
         tables = [contents(network, node, network.interval_means)[1:] for node in sources]
