@@ -283,7 +283,7 @@ def with_changing_contents(network: Network, seed: int) -> Network:
         times = tuple(np.linspace(begin, end, 4).tolist())
         table = rng.dirichlet([1.0] * (len(names) + 1), 4)[:, 1:] * rng.integers(2, size=(4, 1))
         kinds = [str(rng.choice(["step", "linear"])) for _ in names]
-        table[0, 0] = 0.3
+        table[0] = 0.6 / len(names)
         return {
             name: Series(times=times, values=tuple(column.tolist()), interpolation=kind)
             for name, column, kind in zip(names, table.T * 0.7, kinds, strict=True)

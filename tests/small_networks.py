@@ -37,7 +37,7 @@ from cirl_marl.network.disturbances import (
     RandomWalk,
     Seasonal,
 )
-from cirl_marl.network.series import Value
+from cirl_marl.network.series import Value, extremes
 from cirl_marl.network.uncertainty import CAPACITY, Spread
 
 Floats = NDArray[np.float64]
@@ -210,7 +210,8 @@ def without_lifetimes(network: Network) -> Network:
                 "growth": None,
                 "rate": 1 / node.lifetime.mean,
             }
-            node = replace(node, control=control, initial=initial, **plain)
+            content = {name: extremes(part)[1] / 2 for name, part in dict(node.content).items()}
+            node = replace(node, control=control, initial=initial, content=content, **plain)
         nodes.append(node)
     return replace(network, nodes=tuple(nodes))
 
