@@ -27,7 +27,7 @@ from cirl_marl.optimum.supply_limits import _with_ends, with_supply_limits
 def test_the_front_of_two_aims_is_proved_and_reached(tmp_path: Path) -> None:
     """Plans lie on the worse side of the front and near it; prices are its slope; both have a hypervolume."""
     file = tmp_path / "city.toml"
-    write_network(city(), file)
+    write_network(city().with_options(episode={"horizon": 24}), file)
     for axes in (("circularity", "emissions"), ("cost", "emissions")):
         front = account_front(file, axes, min_service=0.9, points=4)
         at_plans = front.at(front.plans[:, 1:])
@@ -45,7 +45,8 @@ def test_the_front_of_two_aims_is_proved_and_reached(tmp_path: Path) -> None:
         assert len(list(csv.reader(lines))) == 4
     assert (tmp_path / "front" / "pareto.png").stat().st_size > 1000
     with pytest.raises(CirlError, match="nothing to weigh"):
-        account_front(with_lambda(load_network("paper_city")), ("circularity", "moved"), min_service=0.9)
+        paper = load_network("paper_city").with_options(episode={"horizon": 24})
+        account_front(with_lambda(paper), ("circularity", "moved"), min_service=0.9)
     with pytest.raises(CirlError, match="nothing to weigh"):  # less ore is less of both
         account_front("copper_world", ("circularity", "emissions"), min_service=1.0)
 
