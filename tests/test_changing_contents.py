@@ -486,3 +486,22 @@ def test_files_say_how_contents_change(tmp_path: Path) -> None:
     assert (network.nodes, network.uncertain) == (unforeseen().nodes, unforeseen().uncertain)
     assert network.disturbed == unforeseen().disturbed
     assert dict(network.scenario("rich").nodes[0].content)["copper"] == 0.3
+
+
+def test_draws_of_histories_are_summed_at_the_same_time() -> None:
+    """Copper and tin of a past in which one gave way to the other are never both at their most."""
+    network, times = mine(), (-5.0, -2.0)
+    past = {"copper": Series(times=times, values=(0.8, 0.1)), "tin": Series(times=times, values=(0.1, 0.8))}
+    lifetime = Lifetime(mean=3.0, deviation=1.0)
+    cars = Node(id="cars", lifetime=lifetime, history=HISTORY, content=past)
+    arcs = (*network.arcs, Arc(id="scrapped", donor="cars", recipient="tailings", law=Law.SHARE))
+
+    def drawn(high: float) -> Network:
+        spread = Spread(low=0.9, high=high, distribution="uniform")
+        return replace(
+            network, nodes=(*network.nodes, cars), arcs=arcs, uncertain={"nodes.cars.content.copper": spread}
+        )
+
+    assert drawn(1.1).uncertain
+    with pytest.raises(NetworkError, match=r"some draws of its contents sum to 1.02, more than 1"):
+        drawn(1.15)

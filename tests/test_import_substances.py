@@ -31,6 +31,7 @@ from cirl_marl.importing.assembly import ImportReport, import_flows
 from cirl_marl.importing.substance_flows import closest_amounts, degrees_of_freedom
 
 HEADER = ["source", "target", "year", "substance", "value", "unit", "uncertainty"]
+STOCKS = ["region", "process", "year", "value", "unit"]
 ROLES = {"nonrenewable_reservoir": ["Mine*"], "landfill": ["[DP]*[pt]"]}
 Row = Sequence[object]
 
@@ -446,6 +447,109 @@ def test_bad_tables_are_refused(rows: list[Row], options: dict[str, bool], messa
     with pytest.raises(CirlError, match="(?s)" + message):
         imported(tmp_path, rows, **options)
     assert not (tmp_path / "net.toml").exists()
+
+
+def contents_of(path: Path) -> dict[str, float]:
+    """Return the content of each flow, without agents."""
+    network = load_network(path)
+    flows, substances = simulated(network)
+    return dict(zip([arc.id for arc in network.arcs], (substances[0, 0] / flows[0]).tolist(), strict=True))
+
+
+def test_traces_are_separated_and_balance_as_what_there_is_most_of(tmp_path: Path) -> None:
+    """An amount counts by what there is of its substance, not by the flow."""
+    imported(tmp_path, sorting((1e-6, 0, 1e-6)))
+    contents = contents_of(tmp_path / "net.toml")
+    assert contents["sorter_to_dump"] == pytest.approx(1e-7) and contents["sorter_to_product"] < 1e-15
+    rows = [*sorting()[:1], ["Mine", "Dump", 2000, "", 10, "kt/year", ""]]
+    rows[0][1] = "Product"
+    rows += [["Mine", "Dump", 2000, "Copper", 0.09, "ppm", ""], ["Mine", "Product", 2000, "Copper", 0, "ppm", ""]]
+    import_flows(table(tmp_path / "source.csv", rows), tmp_path / "source.toml", roles=ROLES)
+    contents = contents_of(tmp_path / "source.toml")
+    assert contents["mine_to_dump"] == pytest.approx(9e-8) and contents["mine_to_product"] == 0.0
+    exact = [*sorting()[:3], *([*row[:6], "0"] for row in sorting((2e-6, 0, 0))[3:])]
+    with pytest.raises(CirlError, match="no amounts of Copper balance"):
+        import_flows(table(tmp_path / "exact.csv", exact), tmp_path / "exact.toml", roles=ROLES, reconcile=True)
+    trace = [[*row[:3], "Tin", row[4] * 1e-9, *row[5:]] for row in sorting((5, 1, 3))[3:]]  # type: ignore[operator]
+    both = table(tmp_path / "both.csv", [*sorting(), *trace])
+    report = import_flows(both, tmp_path / "both.toml", roles=ROLES, reconcile=True)
+    assert report.table.substances is not None
+    ore, product, dump = report.table.substances.amounts[1, 0, 0]
+    assert ore == pytest.approx(product + dump, rel=1e-9) and 4e-9 < ore < 5e-9
+    assert {change.substance for change in report.changes} == {"Tin"}
+
+
+def test_a_row_has_its_own_unit(tmp_path: Path) -> None:
+    """A column that is named by the unit of flows has parts of them where a row of a substance says so."""
+    header = ["source", "target", "year", "substance", "kt_per_year", "unit"]
+    rows = [["Mine", "Dump", 2000, "", 50, ""], ["Mine", "Dump", 2000, "Copper", 4, "%"]]
+    import_flows(table(tmp_path / "flows.csv", rows, header), tmp_path / "net.toml", roles=ROLES)
+    assert contents_of(tmp_path / "net.toml") == {"mine_to_dump": pytest.approx(0.04)}
+
+
+def test_flows_of_a_day_are_those_of_a_year(tmp_path: Path) -> None:
+    """Networks of tables have years; so have amounts of substances without a unit of their own."""
+    rows = [["Mine", "Dump", 2000, "", 1, "kt/day", ""], ["Mine", "Dump", 2000, "Copper", 0.04, "kt/day", ""]]
+    report = imported(tmp_path, rows)
+    assert report.table.unit == "kt/year" and report.table.values == pytest.approx([365.25])
+    assert contents_of(tmp_path / "net.toml") == {"mine_to_dump": pytest.approx(0.04)}
+
+
+def test_what_mixes_mixes_the_flows_that_were_adjusted(tmp_path: Path) -> None:
+    """Contents of what a process hands on are those of what enters it after the flows were reconciled, too."""
+    rows = sorting((4, "", ""))
+    rows[0][4], rows[3][5] = 120, "%"
+    report = imported(tmp_path, rows, reconcile=True)
+    assert {change.substance for change in report.changes} == {""}
+    assert [*contents_of(tmp_path / "net.toml").values()] == pytest.approx([0.04] * 3, rel=1e-9)
+
+
+def test_regions_and_years_tell_for_themselves(tmp_path: Path) -> None:
+    """What one region tells of a process is none of another's, which may be without; a year without rows is refused."""
+    header = [*HEADER, "region"]
+    plain, told = ([[*row, "A"] for row in rows] for rows in (sorting((4, "", "")), sorting()))
+    other = [[*row[:-1], "B"] for row in told]
+    without = [[*row[:-1], "C"] for row in plain[:3]]
+    flows = table(tmp_path / "flows.csv", [*plain, *other, *without], header)
+    report = import_flows(flows, tmp_path / "net.toml", roles=ROLES)
+    assert report.table.substances is not None
+    expected = [[4.0, 3.6, 0.4], [4.0, 1.0, 3.0], [0.0, 0.0, 0.0]]
+    np.testing.assert_allclose(report.table.substances.amounts[0, :, 0], expected, rtol=1e-12)
+    alone = import_flows(flows, tmp_path / "alone.toml", roles=ROLES, regions=["C"])
+    assert alone.table.substances is None
+    later = [[*row[:2], 2001, *row[3:]] for row in sorting()[:3]]
+    with pytest.raises(CirlError, match=r"no row says what there is of Copper in 2001; say it, if only that it is 0"):
+        import_flows(table(tmp_path / "years.csv", [*sorting(), *later]), tmp_path / "years.toml", roles=ROLES)
+
+
+def test_nothing_flows_with_a_content(tmp_path: Path) -> None:
+    """A source that gives nothing has none; a content of a flow that is stated to be 0 says nothing."""
+    rows = [*sorting(), ["Mine2", "Dump", 2000, "", 0, "kt/year", ""], ["Mine", "Dump", 2000, "", 0, "kt/year", ""]]
+    rows.append(["Mine", "Dump", 2000, "Copper", 4, "%", ""])
+    assert imported(tmp_path, rows).content_error < 1e-9
+
+
+@pytest.mark.parametrize("name", ["Stock", "Flow"])
+def test_a_substance_may_be_called_like_a_column(name: str, tmp_path: Path) -> None:
+    """Stores of regions have contents and stocks, in columns of their own."""
+    rows: list[Row] = []
+    for region in "AB":
+        for ends, flow, part in ((("Mine", "Use"), 10, 4), (("Use", "Dump"), 5, 2)):
+            rows.append([*ends, 2000, "", flow, "kt/year", "", region])
+            rows.append([*ends, 2000, name, part, "%", "", region])
+    stocks = table(tmp_path / "stocks.csv", [["A", "Use", 1999, 100, "kt"], ["B", "Use", 1999, 200, "kt"]], STOCKS)
+    flows = table(tmp_path / "flows.csv", rows, [*HEADER, "region"])
+    import_flows(flows, tmp_path / "net.toml", stocks, roles=ROLES, stores=["Use"])
+    store = load_network(f"{tmp_path / 'net.toml'}:b").stores[1]
+    assert store.initial == (200.0, 200.0) and dict(store.content) == {name.lower(): pytest.approx(0.02)}
+
+
+def test_errors_of_what_is_written_name_the_file_that_was_asked_for(tmp_path: Path) -> None:
+    """Not the one beside it that is gone."""
+    rows = [[*row[:3], row[3] and "Remainder", *row[4:]] for row in sorting()]
+    with pytest.raises(CirlError, match=r"net\.toml: substance 'remainder': the id is that of") as failure:
+        imported(tmp_path, rows)
+    assert "partial" not in str(failure.value)
 
 
 def test_the_command_says_what_is_in_it(tmp_path: Path) -> None:

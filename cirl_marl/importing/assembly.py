@@ -110,6 +110,7 @@ def import_flows(
     elif residuals:
         table, reconciliation = processes.reconcile()
         processes = Processes(table, processes.of(ProcessKind.STORE))
+        processes = Processes(processes.mix_substances(), processes.of(ProcessKind.STORE))
     if reconcile and table.substances is not None:
         table, of_substances = processes.reconcile_substances()
         reconciliation = of_substances if reconciliation is None else reconciliation + of_substances
@@ -131,7 +132,10 @@ def import_flows(
     changes = () if reconciliation is None else reconciliation.changes
     with publish_folder(out.parent) as partial:
         files = _write(partial, out.name, name, definition, changes)
-        error, content_error = _largest_errors(partial / out.name, table, processes, definition, progress)
+        try:
+            error, content_error = _largest_errors(partial / out.name, table, processes, definition, progress)
+        except CirlError as failure:
+            raise CirlError(str(failure).replace(str(partial), str(out.parent))) from failure
     mistakes = processes.stock_mistakes(known_stocks)
     return ImportReport(
         table,
@@ -271,7 +275,8 @@ def _largest_errors(
             flows_of_year = np.maximum(table_flows, NOTICEABLE * table_flows.max())
             s, y, k = np.unravel_index(int((errors / flows_of_year).argmax()), errors.shape)
             worst_content = max(worst_content, float((errors / flows_of_year)[s, y, k]))
-            if errors.max() > WRONG * table_flows.max() and not processes.of(ProcessKind.STORE):
+            sizes = table.substances.amounts[:, done].max(axis=(1, 2), keepdims=True)
+            if (errors > WRONG * sizes).any() and not processes.of(ProcessKind.STORE):
                 flow = f"{table.substances.names[s]} of {[*definition.arcs][k]} in {table.years[y]}"
                 raise CirlError(f"{table.name}: the network does not give back {flow}; does it balance?")
         progress((done + 1) / len(ids))

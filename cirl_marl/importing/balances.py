@@ -12,8 +12,13 @@ from scipy.special import chdtrc
 
 from cirl_marl.errors import CirlError
 from cirl_marl.importing.flow_table import Connection, FlowTable
-from cirl_marl.importing.substance_flows import closest_amounts, degrees_of_freedom, excesses, mixed_amounts
-from cirl_marl.network import Floats
+from cirl_marl.importing.substance_flows import (
+    closest_amounts,
+    degrees_of_freedom,
+    excesses,
+    mixed_amounts,
+)
+from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import positional_record
 
 ROUNDING = 1e-6
@@ -173,16 +178,21 @@ class Processes:
         if substances is None:
             return table
         amounts, deviations = substances.amounts.copy(), substances.deviations.copy()
-        transit = np.array([kind is ProcessKind.TRANSIT for kind in self.kinds.values()])
-        is_told = np.asarray(np.isfinite(substances.is_content).any(axis=(1, 2)))
-        for e in range(len(substances.names)):
-            tells = (np.maximum(-self._incidence, 0.0) @ is_told[e]) > 0
-            silent = np.flatnonzero(transit & ~tells)
+        for place in np.ndindex(amounts.shape[:3]):
+            silent = self._silent(place)
             leaves = (self._incidence[silent] < 0).any(axis=0)
-            for r, y in np.ndindex(self.flows.shape[:2]):
-                amounts[e, r, y] = mixed_amounts(amounts[e, r, y], self.flows[r, y], self._incidence, silent)
-            deviations[e][..., leaves] = amounts[e][..., leaves]
+            amounts[place][leaves] = 0.0
+            amounts[place] = mixed_amounts(amounts[place], self.flows[place[1:]], self._incidence, silent)
+            deviations[place][leaves] = amounts[place][leaves]
         return replace(table, substances=replace(substances, amounts=amounts, deviations=deviations))
+
+    def _silent(self, place: tuple[int, ...]) -> Integers:
+        """Return the processes without stock of whose outflows nothing is told; of a substance, region and year."""
+        assert self._table.substances is not None
+        is_told = np.isfinite(self._table.substances.is_content[place])
+        transit = np.array([kind is ProcessKind.TRANSIT for kind in self.kinds.values()])
+        silent: Integers = np.flatnonzero(transit & ~((np.maximum(-self._incidence, 0.0) @ is_told) > 0))
+        return silent
 
     def check_contents(self) -> None:
         """Refuse flows in which there is more of substances than they are; a ``CirlError`` names the first."""
@@ -235,11 +245,13 @@ class Processes:
         """Return substances that balance, are closest to those of the table and within the flows, and what was changed.
 
         The flows stay: each substance balances at every process without stock, and all are together at most the flow
-        (``closest_amounts``). Their deviations are as those of flows, 10 % of amounts that state none.
+        (``closest_amounts``). Deviations are as those of flows, 10 % of amounts
+        that state none.
         """
         table, substances = self._table, self._table.substances
         assert substances is not None
         balances = self._incidence[[kind is ProcessKind.TRANSIT for kind in self.kinds.values()]]
+        sizes = substances.amounts.max(axis=3)
         stated, before = substances.deviations, substances.amounts
         deviations = np.where(before > 0, np.where(np.isnan(stated), UNCERTAIN * before, stated), 0.0)
         amounts, changes, chi_square, degrees = before.copy(), [], 0.0, 0
@@ -255,7 +267,7 @@ class Processes:
                 change = np.divide(closest - measured, spread, out=np.zeros_like(closest), where=spread > 0)
                 chi_square += float((change**2).sum())
                 degrees += degrees_of_freedom(spread, balances)
-                for e, k in np.argwhere(np.abs(closest - measured) > 1e-9 * self.flows[r, y].max()).tolist():
+                for e, k in np.argwhere(np.abs(closest - measured) > 1e-9 * sizes[:, r, y, None]).tolist():
                     cells = float(measured[e, k]), float(closest[e, k]), float(spread[e, k])
                     changes.append(Change(region, year, table.pairs[k], *cells, substances.names[e]))
         result = replace(table, substances=replace(substances, amounts=amounts))

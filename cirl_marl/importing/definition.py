@@ -18,7 +18,7 @@ from cirl_marl.network.declarations import positional_record, with_field_docs
 from cirl_marl.network.elements import Role
 
 ALIKE = 1e-7
-"""Part of the largest flow by which amounts may differ that count as alike, as tables are rounded."""
+"""Part of the largest amount of a substance by which amounts may differ that count as alike, as tables are rounded."""
 SMALL = 1e-300
 
 
@@ -147,7 +147,7 @@ class DefinitionWriter:
         for amounts in self._substances.values():
             parts = self._of_pairs(amounts, pairs)
             mean = parts.sum(axis=2, keepdims=True) * flows / flows.sum(axis=2, keepdims=True).clip(SMALL)
-            if (np.abs(parts - mean) > ALIKE * flows.max()).any():
+            if (np.abs(parts - mean) > ALIKE * amounts.max()).any():
                 return False
         return True
 
@@ -157,7 +157,8 @@ class DefinitionWriter:
         contents = {}
         for id_, amounts in self._substances.items():
             parts = self._of_pairs(amounts, pairs).sum(axis=2)
-            contents[id_] = shares_of(np.stack([parts, np.maximum(flows - parts, 0.0)], axis=2))[..., 0]
+            both = np.stack([parts, np.maximum(flows - parts, 0.0)], axis=2)
+            contents[id_] = shares_of(both)[..., 0] if flows.any() else parts
         return contents
 
     def _splits(self) -> dict[str, Floats]:
@@ -174,7 +175,7 @@ class DefinitionWriter:
             for id_, table in parts.items():
                 amounts = self._of_pairs(table, pairs)
                 through = amounts.sum(axis=2, keepdims=True)
-                if (np.abs(amounts - shares * through) > ALIKE * self._of_pairs(whole, pairs).max()).any():
+                if (np.abs(amounts - shares * through) > ALIKE * table.max()).any():
                     transfers = shares_of(amounts)
                     columns |= {f"{arc} {id_}": transfers[:, :, k] for k, arc in enumerate(arcs)}
         return columns
@@ -226,7 +227,7 @@ class DefinitionWriter:
             return []
         stores = [process for process in self.processes.of(ProcessKind.STORE) if self._first_stocks(process)]
         contents = {
-            f"{substance} of {self._nodes[store]}": content[:, 0]
+            f"content of {substance} in {self._nodes[store]}": content[:, 0]
             for store in self.processes.of(ProcessKind.STORE)
             for substance, content in self._contents(self._pairs_from(store)).items()
         }
@@ -275,7 +276,7 @@ class DefinitionWriter:
                 for substance, content in self._contents(self._pairs_from(process)).items():
                     place = f"value = {_short(content[0, 0])}"
                     if self._regional:
-                        place = self._of_region(f"{substance} of {id_}")
+                        place = self._of_region(f"content of {substance} in {id_}")
                     yield f'content.{substance} = {{ {place}, unit = "1", source = {source} }}'
 
     def _stated_contents(self, source: str) -> Iterator[str]:

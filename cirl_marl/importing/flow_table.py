@@ -86,7 +86,7 @@ class FlowTable:
         substances, first = self.substances, self.years[0]
         if substances is not None and places.size:
             years = slice(int(places[1].min()) - first, int(places[1].max()) - first + 1)
-            substances = substances.part(orders[0][0], years, orders[1][0])
+            substances = substances.part(orders[0][0], years, orders[1][0]).non_zero()
         return replace(
             self,
             regions=tuple(names[0]),
@@ -153,12 +153,20 @@ def _read_flows(path: Path, sheet: str | None, default_unit: str | None, default
     )
     _check_repetitions(table, parts)
     _check_years(table)
-    table = replace(table, unit=_unit(path, units, default_unit))
+    unit = _unit(path, units, default_unit)
+    table = _per_year(replace(table, unit=unit))
     if not substances.entries:
         return table
-    labels = list(map(str, table.pairs))
-    found = substances.flows(table.grid(table.values), table.years[0], table.unit, labels)
-    return replace(table, substances=found)
+    labels, stated_flows = list(map(str, table.pairs)), table.grid(table.values, np.nan)
+    found = substances.flows(stated_flows, table.years[0], table.unit, unit, table.regions, labels)
+    return replace(table, substances=found.non_zero())
+
+
+def _per_year(table: FlowTable) -> FlowTable:
+    """Return the table in masses per year."""
+    unit = f"{table.unit.rpartition('/')[0]}/year"
+    scale = factor(table.unit, unit)
+    return replace(table, values=table.values * scale, deviations=table.deviations * scale, unit=unit)
 
 
 def _check_repetitions(table: FlowTable, parts: Sequence[_Entries]) -> None:

@@ -41,6 +41,13 @@ class SubstanceFlows:
         tables = (self.amounts, self.deviations, self.is_content)
         return SubstanceFlows(self.names, *(table[:, regions][:, :, years][..., pairs] for table in tables))
 
+    def non_zero(self) -> SubstanceFlows | None:
+        """Return the substances of which there is any, or None."""
+        places = np.flatnonzero(self.amounts.any(axis=(1, 2, 3)))
+        tables = (self.amounts, self.deviations, self.is_content)
+        names = tuple(self.names[place] for place in places.tolist())
+        return SubstanceFlows(names, *(table[places] for table in tables)) if names else None
+
 
 @dataclass
 class SubstanceRows:
@@ -49,17 +56,28 @@ class SubstanceRows:
     entries: list[tuple[str, int, str, str, Integers, float, float]] = field(default_factory=list)
 
     def take(self, part: GridPart, unit: str, places: Integers, values: Floats, deviations: Floats) -> None:
-        """Take rows of which ``places`` are region, year and pair; ``unit`` is what the column of values is in."""
-        units = [unit or text.strip() for text in part.of("unit")]
+        """Take rows of which ``places`` are region, year and pair; ``unit`` is that of rows that state none."""
+        units = [text.strip() or unit for text in part.of("unit")]
         names = map(str.strip, part.of("substance"))
         rows = zip(names, part.lines, units, places.T, values.tolist(), deviations.tolist(), strict=True)
         self.entries += ((name, line, part.grid.name, *row) for name, line, *row in rows)
 
-    def flows(self, grid: Floats, first_year: int, unit: str, labels: Sequence[str]) -> SubstanceFlows:
+    def flows(
+        self, grid: Floats, first_year: int, unit: str, stated_unit: str, regions: Sequence[str], labels: Sequence[str]
+    ) -> SubstanceFlows:
         """Return the substances in flows, shape (regions, years, pairs), mass/time in ``unit``.
 
+        Args:
+            grid: the flows, NaN where the table states none.
+            first_year: of the table.
+            unit: of the flows.
+            stated_unit: of rows that state none.
+            regions: their names.
+            labels: names of the pairs.
+
         Raises:
-            CirlError: naming the line of a substance in what does not flow, one that stands twice, or a wrong unit.
+            CirlError: naming the line of a substance in what does not flow, one that stands twice, a wrong unit, or a
+                year of which nothing is told while there are others.
         """
         names = tuple(dict.fromkeys(name for name, *_ in self.entries))
         amounts, lines = np.zeros((len(names), *grid.shape)), np.zeros((len(names), *grid.shape), dtype=np.intp)
@@ -67,32 +85,38 @@ class SubstanceRows:
         for name, line, sheet, text, (region, year, pair), value, deviation in self.entries:
             place = names.index(name), region, year - first_year, pair
             flow, subject = _cell(grid, place[1:]), f"{sheet}, line {line}: {name} of {labels[pair]} in {year}"
-            if not flow:
+            if np.isnan(flow):
                 raise CirlError(f"{subject}: there is no such flow; give the flow itself in a row without substance")
             if lines[place]:
                 raise CirlError(f"{subject} stands in line {lines[place]} too; leave one out")
-            scale, is_part = _scale(f"{sheet}, line {line}", text, unit)
+            scale, is_part = _scale(f"{sheet}, line {line}", text or stated_unit, unit)
             scale *= flow if is_part else 1.0
             amounts[place], deviations[place] = value * scale, deviation * scale
             is_content[place], lines[place] = is_part, line
+        is_told, flows_at_all = (lines > 0).any(axis=3), np.asarray(grid > 0).any(axis=2)
+        is_told_ever = np.any(is_told, axis=2, keepdims=True)
+        for e, r, y in np.argwhere(is_told_ever & ~is_told & flows_at_all).tolist():
+            year = f"{first_year + y} in {regions[r]}" if regions[r] else str(first_year + y)
+            sheet = self.entries[0][2]
+            raise CirlError(f"{sheet}: no row says what there is of {names[e]} in {year}; say it, if only that it is 0")
         return SubstanceFlows(names, amounts, deviations, is_content)
 
 
 def _cell(grid: Floats, place: tuple[int, ...]) -> float:
     within = all(0 <= i < size for i, size in zip(place, grid.shape, strict=True))
-    return float(grid[place]) if within else 0.0
+    return float(grid[place]) if within else np.nan
 
 
 def _scale(subject: str, text: str, unit: str) -> tuple[float, bool]:
     """Return by what an amount in a unit is multiplied, and whether it is a part of the flow."""
     try:
-        return factor(text or unit, "1"), True
+        return factor(text, "1"), True
     except CirlError:
         yearly = unit.rpartition("/")[0]
     faults = []
     for target in (unit, yearly):
         try:
-            return factor(text or unit, target), False
+            return factor(text, target), False
         except CirlError as error:
             faults.append(error)
     raise CirlError(f"{subject}: {faults[0]}; of a substance give a part, as in % or ppm, or an amount in {unit}")
@@ -123,7 +147,8 @@ def excesses(amounts: Floats, flows: Floats) -> Iterator[tuple[int, int, int]]:
 def closest_amounts(amounts: Floats, deviations: Floats, flow: Floats, balances: Floats) -> Floats | None:
     """Return amounts of all substances in the flows of a year that balance and are closest; None if there are none.
 
-    They minimise Σ ((x − m)/σ)² for balances·x_e = 0 of each substance e, x ≥ 0 and Σ_e x_e ≤ flow. Where σ = 0 x is m.
+    They minimise Σ ((x − m)/σ)² for balances·x_e = 0 of each substance e, x ≥ 0 and Σ_e x_e ≤ flow. Where σ = 0 x is
+    m. Each substance is measured by its own largest amount, so that traces balance as well as what there is most of.
     In the deviations z the equalities leave z = z₀ + N y, z₀ the shortest solution, and what is left is the least y
     within inequalities, which non-negative least squares solve (Lawson and Hanson 1974, ch. 23, LDP).
 
@@ -133,14 +158,15 @@ def closest_amounts(amounts: Floats, deviations: Floats, flow: Floats, balances:
         flow: of which they are parts, shape (pairs,), mass/time.
         balances: what enters less what leaves processes without stock, shape (processes, pairs).
     """
-    count, size = len(amounts), float(flow.max(initial=0.0)) or 1.0
-    spread, start = deviations.ravel() / size, amounts.ravel() / size
+    largest = amounts.max(axis=1, keepdims=True)
+    size = np.where(largest > 0, largest, 1.0)
+    spread, start, whole = (deviations / size).ravel(), (amounts / size).ravel(), float(flow.max(initial=0.0)) or 1.0
     free = np.flatnonzero(spread > 0)
-    of_each = np.kron(np.eye(count), balances)
+    of_each = np.kron(np.eye(len(amounts)), balances)
     equal, equal_to = (of_each * spread)[:, free], -of_each @ start
-    limits = np.kron(np.ones(count), -np.eye(len(flow)))
+    limits = np.concatenate([-part * np.eye(len(flow)) for part in (size / whole).ravel()], axis=1)
     rows = np.concatenate([np.eye(len(start)), limits])
-    under, under_to = (rows * spread)[:, free], np.concatenate([-start, -flow / size - limits @ start])
+    under, under_to = (rows * spread)[:, free], np.concatenate([-start, -flow / whole - limits @ start])
     left, values, right = np.linalg.svd(equal)
     rank = int((values > EXACT * values.max(initial=0.0)).sum())
     shortest = right[:rank].T @ (left[:, :rank].T @ equal_to / values[:rank])

@@ -22,8 +22,9 @@ from cirl_marl.network.declarations import (
     with_number,
 )
 from cirl_marl.network.elements import FIXED_LIFETIME, Arc, Compartment, Control, ControlKind, Law, Node, Service
+from cirl_marl.network.initial_ages import content_edges
 from cirl_marl.network.rowsum import Floats, Integers, single_column
-from cirl_marl.network.series import Series, Value, extremes, in_intervals, series_of
+from cirl_marl.network.series import Series, Value, extremes, in_intervals, means, series_of
 from cirl_marl.network.specification import Specification
 from cirl_marl.network.split_fractions import ROUNDING, Split, proportions, splits, trap_problems
 from cirl_marl.network.substances import (
@@ -126,7 +127,8 @@ def _factor_range(network: Specification, path: str, *, with_draws: bool = True)
     ends = network.disturbances[disturbed.by].ends
     if not disturbed.adds:
         return min(low * ends[0], high * ends[0]), high * ends[1]
-    parts = disturbed.scale / stated_means(network, path)
+    with np.errstate(divide="ignore"):  # of a number that is 0 no factor is finite, which is refused
+        parts = disturbed.scale / stated_means(network, path)
     corners = [end * float(part) for end in ends for part in (parts.min(), parts.max())]
     return low + min(corners), high + max(corners)
 
@@ -230,9 +232,9 @@ def _no_content(network: Specification, node: Node, path: str) -> str:
     """Return why the contents of a node cannot be drawn or disturbed, or nothing."""
     if path in network.disturbed and is_past(node, CONTENT):
         return "what is in a stock at the start cannot be disturbed in time, but drawn"
+    edges = content_edges(network, node)
     parts = [
-        (np.array(extremes(part)[1]) if is_past(node, CONTENT) else network.interval_means(part))
-        * _factor_range(network, f"nodes.{node.id}.{CONTENT}{id_}")[1]
+        means(part, edges) * _factor_range(network, f"nodes.{node.id}.{CONTENT}{id_}")[1]
         for id_, part in dict(node.content).items()
     ]
     most = float(np.max(sum(parts)))

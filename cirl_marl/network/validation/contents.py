@@ -10,7 +10,7 @@ from cirl_marl.errors import unknown_name
 from cirl_marl.network.declarations import bound_problems
 from cirl_marl.network.elements import Arc, ControlKind, Law, Node
 from cirl_marl.network.initial_ages import content_edges
-from cirl_marl.network.series import Series, extremes, means
+from cirl_marl.network.series import Series, means
 from cirl_marl.network.specification import Specification
 from cirl_marl.network.split_fractions import SUMS
 from cirl_marl.network.substances import REMAINDER, changing_sources
@@ -35,9 +35,9 @@ def substance_problems(network: Specification) -> Iterator[str]:
     yield from _service_problems(network, substances)
     if substances:
         yield from _motion_problems(network)
-        sources = {id_ for node in network.nodes for id_, part in dict(node.content).items() if extremes(part)[1]}
+        stated = {id_ for node in network.nodes for id_ in dict(node.content)}
         for id_ in substances:
-            if id_ not in sources:
+            if id_ not in stated:
                 yield f"substance '{id_}': no node has any of it; give the content of stocks, such as that of a source"
 
 
