@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,22 @@ from small_networks import city, with_lambda
 from test_supply import town
 from typer.testing import CliRunner
 
-from cirl_marl import CirlError, MultiAgentVectorEnv, Network, account_front, load_network, write_network
+from cirl_marl import (
+    Account,
+    Arc,
+    CirlError,
+    Control,
+    ControlKind,
+    Episode,
+    Law,
+    MultiAgentVectorEnv,
+    Network,
+    Node,
+    Service,
+    account_front,
+    load_network,
+    write_network,
+)
 from cirl_marl.cli import app
 from cirl_marl.controllers import Constant
 from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
@@ -107,8 +123,12 @@ def test_plans_that_do_more_than_is_demanded_dominate_no_more_than_is_proved() -
         levels=np.array([0.75, 1.0]),
         shortages=np.zeros(2),
         as_usual=np.array([-9.0, 0.5]),
+        is_limited=np.zeros(2, dtype=bool),
+        least=-9.0,
     )
     assert front.volumes == pytest.approx((0.5 * 0.25, 0.25 * 0.25))
+    limited = replace(front, is_limited=np.array([False, True]), least=-1.1)
+    np.testing.assert_allclose(limited.at([[0.5], [0.75], [1.0]]), [-1.0, -1.0, -1.1])
 
 
 @pytest.mark.parametrize(
@@ -201,3 +221,63 @@ def test_nothing_is_limited_where_nothing_is_proved(monkeypatch: pytest.MonkeyPa
     assert with_supply_limits(poor, 1.01 * poor.objective) == scarce
     monkeypatch.setattr(supply_limits, "LARGE", 1)
     assert with_supply_limits(solution, solution.objective) is network
+
+
+def corner() -> Network:
+    """Return cars whose metal is recycled or reused, each at a cost of its own, and two mines that make up for it."""
+
+    def chosen(name: str, recipient: str, **accounts: float) -> Arc:
+        control = Control(kind=ControlKind.SHARE, low=0.0, neutral=0.0, high=0.45)
+        return Arc(id=name, donor="cars", recipient=recipient, law=Law.SHARE, control=control, accounts=accounts)
+
+    def mined(name: str, weight: float, high: float) -> Arc:
+        control = Control(kind=ControlKind.FLOW, low=0.0, neutral=0.0, high=high)
+        return Arc(
+            id=f"mined_{name}",
+            donor=name,
+            recipient="market",
+            law=Law.CONTROLLED,
+            control=control,
+            makes_up_for="driving",
+            weight=weight,
+            accounts={"cost": 0.01, "emissions": 0.01},
+        )
+
+    return Network(
+        name="corner",
+        nodes=(
+            Node(id="ore", role=Role.NONRENEWABLE_RESERVOIR),
+            Node(id="tailings", initial=(5000.0, 5000.0)),
+            Node(id="market", stores=False),
+            Node(id="cars", rate=0.3, initial=(100.0, 100.0)),
+            Node(id="dump", initial=(0.0, 0.0)),
+        ),
+        arcs=(
+            mined("ore", 0.9, 16.0),
+            mined("tailings", 0.1, 99.0),
+            chosen("recycling", "market", emissions=1.0),
+            chosen("reuse", "market", cost=1.0),
+            Arc(id="sold", donor="market", recipient="cars", law=Law.SHARE),
+            Arc(id="dumped", donor="cars", recipient="dump", law=Law.SHARE),
+        ),
+        services=(Service(id="driving", provider="cars", quantity="stock", low=100.0),),
+        accounts=(Account(id="cost", unit="EUR_2023"), Account(id="emissions", unit="t CO2e")),
+        episode=Episode(horizon=1),
+        time_unit="year",
+        mass_unit="t",
+        default_agents=("recycling", "reuse"),
+    )
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("min_service", [0.95, 0.99])
+def test_limits_of_supplies_prove_nothing_of_worse_episodes(min_service: float) -> None:
+    """Without recycling and reuse both are cheapest, though no episode of limited supplies can be like that."""
+    network = corner()
+    front = account_front(network, ("circularity", "cost", "emissions"), min_service=min_service, points=3)
+    env = MultiAgentVectorEnv(network, num_envs=1)
+    for recycling, reuse in itertools.product(np.linspace(-1.0, 1.0, 5).tolist(), repeat=2):
+        run = rollout(env, Constant({"recycling": recycling, "reuse": reuse}))
+        if run.episode_levels[0, 0] >= min_service:
+            assert run.episode_circularity[0] <= front.at(run.accounts[:1])[0] + 1e-6
+    assert front.is_limited.any()

@@ -24,6 +24,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, unknown_name, whole_number
 from cirl_marl.evaluation.comparison import ProgressReport
 from cirl_marl.network import Floats, Network
+from cirl_marl.network.compartment_model import Bools
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import CIRCULARITY
 from cirl_marl.optimum import Bound, bound, improve_plan, simulate_plan
@@ -57,6 +58,8 @@ class AccountFront:
     levels: Annotated[Floats, "least mean level of a service under each plan, shape (k,)"]
     shortages: Annotated[Floats, "most that a plan is short of a service or exceeds its budget, relative, shape (k,)"]
     as_usual: Annotated[Floats, "the aims under neutral control, shape (d,)"]
+    is_limited: Annotated[Bools, "bounds that hold for episodes at least as good as ``least`` alone, shape (k,)"]
+    least: Annotated[float, "objective, which is λ̄ or minus a total"]
 
     @property
     def signs(self) -> Floats:
@@ -73,8 +76,10 @@ class AccountFront:
     def at(self, demands: ArrayLike) -> Floats:
         """Return what is proved of the first, shape (n,), at other demands, shape (n, d − 1)."""
         points = np.reshape(demands, (-1, len(self.axes) - 1))
-        lines = self.signs[0] * self.bounds + ((points[:, None] - self.demands) * self.prices).sum(axis=2)
-        return np.asarray(self.signs[0] * lines.min(axis=1))
+        planes = self.signs[0] * self.bounds + ((points[:, None] - self.demands) * self.prices).sum(axis=2)
+        limited = planes.min(axis=1, where=self.is_limited, initial=np.inf)
+        always = planes.min(axis=1, where=~self.is_limited, initial=np.inf)
+        return np.asarray(self.signs[0] * np.minimum(always, np.maximum(limited, self.least)))
 
     @property
     def volumes(self) -> tuple[float, float]:
@@ -183,19 +188,20 @@ class _Sweep:
         self._accounts = [account.id for account in network.accounts]
         self._services = [service.id for service in network.services]
         progress("bounds and plans", 0.0)
-        self._programs = network
+        self.are_limited: list[bool] = []
         free = bound(network, aim=axes[0], min_service=min_service)
         self._least = min(self._aims.value(self._plan_of_best(axis)) for axis in axes[1:])
         self._programs = with_supply_limits(free, self._least)
+        self._has_limits = self._programs is not free.network
 
     def _plan_of_best(self, axis: str) -> Rollout:
         """Return the episode of the plan that has most of a service, or least of an account."""
         if axis in self._accounts:
-            return self._carried_out(bound(self._programs, aim=axis, min_service=self.min_service))
+            return self._carried_out(bound(self.definition, aim=axis, min_service=self.min_service))
         service = self._services.index(axis)
         levels = self.min_service.copy()
-        levels[service] = highest_level(self._programs, service, levels) - WITHIN_REACH
-        return self._carried_out(bound(self._programs, aim=self.axes[0], min_service=levels))
+        levels[service] = highest_level(self.definition, service, levels) - WITHIN_REACH
+        return self._carried_out(bound(self.definition, aim=self.axes[0], min_service=levels))
 
     def _carried_out(self, solution: Bound) -> Rollout:
         """Return the episode of the network under the plan of a program."""
@@ -203,25 +209,24 @@ class _Sweep:
 
     def run(self, axes: tuple[str, ...], budgets: Mapping[str, float], levels: Floats) -> None:
         """Solve the program at some demands, or those at several demands on the last of ``axes``."""
-        first, last = axes[0], axes[-1]
+        last = axes[-1]
         if len(axes) == 1:
-            solution = bound(self._programs, aim=first, at_most=budgets, min_service=levels)
-            if solution.objective < self._least:  # limits of supplies are none of episodes as bad as this
-                solution = bound(self.definition, aim=first, at_most=budgets, min_service=levels)
+            solution, is_limited = self._best(budgets, levels)
             self.solutions.append(solution)
+            self.are_limited.append(is_limited)
             self.runs.append(self._carried_out(solution))
             self.demands.append([budgets.get(axis, levels[self._place(axis)]) for axis in self.axes[1:]])
             share = len(self.solutions) / self.points ** (len(self.axes) - 1)
             self._progress("bounds and plans", share)
             return
-        free = bound(self._programs, aim=first, at_most=budgets, min_service=levels)
+        free, _ = self._best(budgets, levels)
         if last in self._accounts:
             place = self._accounts.index(last)
-            best = bound(self._programs, aim=last, at_most=budgets, min_service=levels)
+            best = bound(self.definition, aim=last, at_most=budgets, min_service=levels)
             ends = float(self._carried_out(best).accounts[0, place]), float(free.accounts[place])
         else:
             place = self._services.index(last)
-            most = highest_level(self._programs, place, levels, budgets) - WITHIN_REACH
+            most = highest_level(self.definition, place, levels, budgets) - WITHIN_REACH
             ends = float(free.levels[place]), most
         is_range = ends[1] - ends[0] > TIGHTEST * abs(ends[1])
         for demand in np.linspace(*ends, self.points).tolist() if is_range else [max(ends)]:
@@ -229,6 +234,21 @@ class _Sweep:
             if last in self._services:
                 more[self._services.index(last)] = demand
             self.run(axes[:-1], {**budgets, last: demand} if last in self._accounts else budgets, more)
+
+    def _best(self, budgets: Mapping[str, float], levels: Floats) -> tuple[Bound, bool]:
+        """Return the bound on the first aim at some demands, and whether it is that of limited supplies.
+
+        Limits are none of episodes that are worse than where others are best, all that there may be at these demands.
+        """
+        aim = self.axes[0]
+        if self._has_limits:
+            try:
+                solution = bound(self._programs, aim=aim, at_most=budgets, min_service=levels)
+            except CirlError:
+                return bound(self.definition, aim=aim, at_most=budgets, min_service=levels), False
+            if solution.objective >= self._least:
+                return solution, True
+        return bound(self.definition, aim=aim, at_most=budgets, min_service=levels), False
 
     def _place(self, axis: str) -> int:
         """Return the position of a service; 0 of what is none."""
@@ -252,6 +272,8 @@ class _Sweep:
             levels=np.array([float(run.least_service[0]) for run in self.runs]),
             shortages=np.array([shortage(solution, run) for solution, run in pairs]),
             as_usual=np.array(self._coordinates(as_usual)),
+            is_limited=np.array(self.are_limited),
+            least=self._least,
         )
 
     def _prices(self, solution: Bound) -> list[float]:

@@ -74,8 +74,8 @@ def with_supply_limits(bound: Bound, least: float) -> Network:
             rows = np.array(proved, dtype=np.intp)[:, None]
             end[rows, arcs] = low[rows, arcs] + weight * extent[rows.ravel()].min(axis=1, keepdims=True)
     ids = [arc.id for arc in admissible.network.arcs]
-    changes = np.flatnonzero((end < high).any(axis=0))
-    return _with_ends(network, {ids[k]: end[:, k] for k in changes.tolist()})
+    changes = np.flatnonzero((end < high).any(axis=0)).tolist()
+    return _with_ends(network, {ids[k]: end[:, k] for k in changes}) if changes else network
 
 
 def _windows(intervals: Integers, supply: Floats, room: Floats) -> Iterator[list[int]]:
