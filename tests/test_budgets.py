@@ -223,8 +223,8 @@ def test_the_rest_of_a_plan_stays_where_a_new_one_is_worse() -> None:
     idle = np.full_like(plan.actions, -1.0)
     level, bookings, value = control._planner.futures[0].carry_out(plan.task, idle)
     worse = replace(plan, actions=idle, level=np.minimum(level, 1.0).mean(axis=0), bookings=bookings, value=value)
-    assert (control._planner.better_of(worse, plan).actions == plan.actions).all()
-    assert control._planner.better_of(plan, worse) is plan
+    assert (control._planner.better_of(worse, plan.actions).actions == plan.actions).all()
+    assert control._planner.better_of(plan, worse.actions) is plan
 
 
 @pytest.mark.parametrize("changes", [True, False])

@@ -282,6 +282,19 @@ def test_what_was_learnt_may_leave_no_plan(monkeypatch: pytest.MonkeyPatch) -> N
     np.testing.assert_allclose(replayed.flow, run.flow, rtol=1e-9)
 
 
+def test_neutral_actions_are_taken_where_a_plan_does_worse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program relaxes what constant controls can do, so that its plan may be worse than to do nothing."""
+    env, plan = MultiAgentVectorEnv("copper_net", num_envs=1, horizon=8), WindowPlanner.plan
+
+    def worse(self: WindowPlanner, *arguments: Any) -> WindowPlan:
+        found = plan(self, *arguments)
+        return replace(found, actions=np.ones_like(found.actions), value=-1e9)
+
+    monkeypatch.setattr(WindowPlanner, "plan", worse)
+    run, neutral = (rollout(env, controller, seed=1) for controller in (MPC(min_service=0.9), Neutral()))
+    np.testing.assert_array_equal(run.flow, neutral.flow)
+
+
 def test_without_windows_the_plan_of_the_episode_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where no window is solved, MPC goes on as the plan of the episode says, which it has for its prices."""
     env = MultiAgentVectorEnv("copper_net", num_envs=1, horizon=12)

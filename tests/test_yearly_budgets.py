@@ -244,6 +244,8 @@ def test_budgets_per_year_need_every_interval() -> None:
         env.step(env.neutral_action)
     with pytest.raises(CirlError, match="budgets per year need every interval"):
         control.act({})
+    with pytest.raises(CirlError, match="budgets per year need every interval"):  # what the year booked is not known
+        control.start(env, 0)
 
 
 def test_intervals_are_of_the_year_of_their_middle() -> None:

@@ -50,6 +50,7 @@ LEAST_PRICE = 0.1
 WINDOW = 3
 """Decisions that a plan looks ahead where the network is disturbed, unless another number is asked for. What comes
 after them has its price, and nobody knows it: on paper_city and steel_japan longer windows did no better."""
+FROM_START = "MPC: budgets per year need every interval of an episode, from its start on"
 NOTABLE = 2e-3
 """Part of a budget, or level of a service, by which a plan misses it and says so."""
 FIRST_SAMPLE, SAMPLES = 2**30, 256
@@ -81,11 +82,17 @@ class _Bookings:
     """What was booked of each budget in each copy, followed from interval to interval for those per year."""
 
     def __init__(self, aims: Aims, env: MultiAgentVectorEnv) -> None:
-        """Begin with what the episodes of ``env`` have booked so far; of years it is what comes from now on."""
+        """Begin with what the episodes of ``env`` have booked so far.
+
+        Raises:
+            ControlError: if a budget is per year and an episode has begun.
+        """
         self._aims, self._env, self._counts = aims, env, aims.counts(env.ledger)
         self._accounts = [budget.account for budget in aims.budgets]
         self._by_year = np.flatnonzero([budget.year is not None for budget in aims.budgets])
         self._step, self._totals = env.physical.step.copy(), env.physical.accounts.copy()
+        if len(self._by_year) and self._step.any():
+            raise ControlError(FROM_START)
         self._in_years = np.zeros((len(self._by_year), env.num_envs))
 
     def follow(self, is_new: Sequence[bool]) -> None:
@@ -97,7 +104,7 @@ class _Bookings:
         state, ledger = self._env.physical, self._env.ledger
         moved = np.flatnonzero((state.step != self._step) & ~np.array(is_new))
         if len(self._by_year) and (state.step[moved] != self._step[moved] + 1).any():
-            raise ControlError("MPC: budgets per year need every interval of an episode, from its start on")
+            raise ControlError(FROM_START)
         before, accounts = self._step[moved], np.array(self._accounts, dtype=np.intp)[self._by_year]
         change = (state.accounts - self._totals)[accounts][:, moved]
         amounts = change / ledger.discount[accounts][:, before]
@@ -307,7 +314,9 @@ class MPC(Planner):
             self._outlooks.pop(copy, None)
         if len(window) == len(rest):
             plan = self._plan(copy, window, demands, last)
-            return plan if last is None or not len(demands.limits) else self._planner.better_of(plan, last)
+            if last is None or not len(demands.limits) or last.task.intervals.stop != window.stop:
+                return plan
+            return self._planner.better_of(plan, last.actions[window.start - last.task.intervals.start :])
         if outlook is None and copy not in self._outlooks:
             self._outlooks[copy] = self._plan(copy, rest, demands, None, is_outlook=True)
         outlook = outlook or self._outlooks[copy]
@@ -342,8 +351,7 @@ class MPC(Planner):
             if plan is not None and step in plan.task.intervals:
                 first = step - plan.task.intervals.start
                 return _Plan(episode, step, plan.actions[first : first + self._replan], plan)
-        neutral = np.concatenate([action[copy] for action in self._env.neutral_action.values()])
-        return _Plan(episode, step, np.tile(neutral, (self._replan, 1)), None)
+        return _Plan(episode, step, np.tile(self._neutral_entries(copy), (self._replan, 1)), None)
 
     def _plan(
         self,
@@ -367,7 +375,14 @@ class MPC(Planner):
         """
         stock = self._env.physical.stock[self._env.rows.nodes, copy]
         planner = self._planner if is_outlook or self._drawn is None else self._planners[copy]
-        return self._solve_task(planner, stock, intervals, demands, last, later, is_outlook=is_outlook)
+        plan = self._solve_task(planner, stock, intervals, demands, last, later, is_outlook=is_outlook)
+        if is_outlook or self._drawn is not None:
+            return plan
+        return planner.better_of(plan, np.tile(self._neutral_entries(copy), (len(intervals), 1)))
+
+    def _neutral_entries(self, copy: int) -> Floats:
+        """Return neutral actions of a copy, shape (entries,)."""
+        return np.concatenate([action[copy] for action in self._env.neutral_action.values()])
 
     def _solve_task(
         self,

@@ -395,16 +395,13 @@ class WindowPlanner:
         plan = WindowPlan(task, joint.problem, solution, trials[0].actions, corrections, *reached, merit=0.0)
         return replace(plan, merit=self._merit(plan, task.price))
 
-    def better_of(self, plan: WindowPlan, last: WindowPlan) -> WindowPlan:
-        """Return a plan, or in its place the rest of the ``last`` one if that does better at the same prices."""
-        actions = last.actions[plan.task.intervals.start - last.task.intervals.start :]
-        if len(actions) != len(plan.task.intervals):
-            return plan
+    def better_of(self, plan: WindowPlan, actions: Floats) -> WindowPlan:
+        """Return a plan, or in its place other actions of its intervals if they do better at the same prices."""
         level, bookings, value = self.futures[0].carry_out(plan.task, actions)
         level = np.minimum(level, 1.0).mean(axis=0)
-        rest = replace(plan, actions=actions, level=level, bookings=bookings, value=value)
-        merit = self._merit(rest, plan.task.price)
-        return replace(rest, merit=merit) if merit > self._merit(plan, plan.task.price) else plan
+        other = replace(plan, actions=actions, level=level, bookings=bookings, value=value)
+        merit = self._merit(other, plan.task.price)
+        return replace(other, merit=merit) if merit > self._merit(plan, plan.task.price) else plan
 
     def _merit(self, plan: WindowPlan, price: Floats) -> float:
         """Return the objective of a plan, less what it exceeds and lacks at a price, shape (budgets + services,)."""
