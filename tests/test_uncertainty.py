@@ -193,6 +193,7 @@ def test_files_state_it(tmp_path: Path) -> None:
     [
         ("range = [1.5, 0.5]", r"arcs.dross.share.range: \[1.5, 0.5\] must have its lower end first, 1"),
         ("range = [1.2, 1.5]", r"range: \[1.2, 1.5\] must contain the number, 1"),
+        ("range = [-0.5, 1.5]", r"range: \[-0.5, 1.5\] must not cross 0: a number keeps its sign"),
         (
             "deviation = -1",
             r"arcs.dross.share: deviation -1: what spreads must not be 0, and its deviation must be positive",

@@ -323,6 +323,9 @@ class Converter:
             demand = "contain the number" if low < high else "have its lower end first"
             self.mistakes.append(f"{path}.range: {list(span or ())} must {demand}, {middle / unit:g}")
             return
+        if low < 0:
+            self.mistakes.append(f"{path}.range: {list(span or ())} must not cross 0: a number keeps its sign")
+            return
         kind = quantity.distribution or ("uniform" if deviation is None else "normal")
         self.uncertain[path] = Spread(deviation=relative, low=low, high=high, distribution=kind)
 
