@@ -12,7 +12,20 @@ import numpy as np
 import pytest
 from small_networks import cycle
 
-from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Objective, Role, Service, load_network
+from cirl_marl import (
+    Account,
+    Arc,
+    Control,
+    ControlKind,
+    Episode,
+    Law,
+    Network,
+    Node,
+    Objective,
+    Role,
+    Service,
+    load_network,
+)
 from cirl_marl.controllers.basic import Neutral
 from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.definitions.catalogue import folder
@@ -293,6 +306,30 @@ def test_neutral_actions_are_taken_where_a_plan_does_worse(monkeypatch: pytest.M
     monkeypatch.setattr(WindowPlanner, "plan", worse)
     run, neutral = (rollout(env, controller, seed=1) for controller in (MPC(min_service=0.9), Neutral()))
     np.testing.assert_array_equal(run.flow, neutral.flow)
+
+
+def test_valves_open_for_orders() -> None:
+    """A donor whose outflows are orders alone opens its valve as far as the largest of them needs."""
+    orders = [
+        Arc(id=name, donor="a", recipient=name[-1], law=Law.EXOGENOUS, flow=flow, control=valve(0.0, 1.0))
+        for name, flow in (("to_b", 10.0), ("to_c", 5.0))
+    ]
+    network = Network(
+        name="orders",
+        nodes=(
+            Node(id="a", initial=(1000.0, 1000.0), control=replace(valve(0.0, 1.5), neutral=0.25)),
+            Node(id="b", initial=(0.0, 0.0)),
+            Node(id="c", initial=(0.0, 0.0)),
+        ),
+        arcs=tuple(replace(arc, accounts={"cost": -1.0}) for arc in orders),
+        accounts=(Account(id="cost", unit="EUR_2023"),),
+        episode=Episode(horizon=4),
+    )
+    found = bound(network, aim="cost")
+    assert found.objective == pytest.approx(90.0)  # 1.5 times all that is ordered, four times
+    controlled = rollout(MultiAgentVectorEnv(network, num_envs=1), MPC(aim="cost"))
+    for run in (simulate_plan(found), controlled):
+        assert -run.accounts[0, 0] == pytest.approx(90.0)
 
 
 def test_without_windows_the_plan_of_the_episode_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:

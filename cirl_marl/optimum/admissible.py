@@ -343,9 +343,9 @@ def normalised_actions(
 ) -> Floats:
     """Return the actions whose constant factors give the planned mean flows at the planned mean stocks.
 
-    v = Z̄/X̄ where a node has several outflows, else what its outflow asks with its own control neutral; then
-    w_k = f̄_k/(a_k·v·X̄_p) and u_k = f̄_k/v, each clipped to its range. A share is such a w_k, of what is released. A
-    stretch is what leaves the planned stock at the end of the interval.
+    v = Z̄/X̄ where a node has several outflows, else the most that its outflow or orders ask with their own controls
+    neutral; then w_k = f̄_k/(a_k·v·X̄_p) and u_k = f̄_k/v, each clipped to its range. A share is such a w_k, of what is
+    released. A stretch is what leaves the planned stock at the end of the interval.
 
     Args:
         admissible: ranges of the factors.
@@ -362,12 +362,14 @@ def normalised_actions(
     valve_range, base = admissible.valve[:, period], admissible.base[period]
     stock, flow, through = layout.means(plan)
     neutral, valve = admissible.neutral_setting[period], admissible.neutral_valve[period].copy()
-    by_donor = admissible.driver == network.donors
-    for k in np.flatnonzero(by_donor):
-        donor = int(network.donors[k])
-        if donor not in layout.valves and (valve_range[0, :, donor] < valve_range[1, :, donor]).any():
-            unit = base[:, k] * neutral[:, k] * stock[:, donor]
-            valve[:, donor] = _ratio(flow[:, k], unit, valve[:, donor])
+    is_driven = admissible.by_schedule | (admissible.driver == network.donors)
+    movable = np.setdiff1d(np.flatnonzero((valve_range[0] < valve_range[1]).any(axis=0)), layout.valves)
+    for donor in np.intersect1d(movable, network.donors[is_driven]).tolist():
+        outflows = np.flatnonzero(is_driven & (network.donors == donor))
+        drivers = np.where(admissible.by_schedule[outflows], 1.0, stock[:, [donor]])
+        unit = base[:, outflows] * neutral[:, outflows] * drivers
+        asked = _ratio(flow[:, outflows], unit, np.repeat(valve[:, [donor]], len(outflows), axis=1))
+        valve[:, donor] = asked.max(axis=1)
     for z, node in enumerate(layout.valves):
         valve[:, node] = _ratio(through[:, z], stock[:, node], valve[:, node])
     # what is left of f̄_k after the valve is the arc's own factor, w_k = f̄_k/(a_k·v·X̄_p)
