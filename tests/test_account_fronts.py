@@ -36,6 +36,7 @@ from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
 from cirl_marl.evaluation.account_front import AccountFront, _Sweep, volume_dominated
 from cirl_marl.network.elements import Role
 from cirl_marl.optimum import bound, improve_plan, simulate_plan, supply_limits
+from cirl_marl.optimum.bounds import highest_level
 from cirl_marl.optimum.supply_limits import _with_ends, with_supply_limits
 
 
@@ -212,7 +213,7 @@ def test_nothing_is_limited_where_nothing_is_proved(monkeypatch: pytest.MonkeyPa
     """Of episodes however bad, of supplies that are alike or may run dry, and of programs that are too large."""
     network = two_sources()
     solution = bound(network, min_service=0.999)
-    assert with_supply_limits(solution, -1e6) == network
+    assert with_supply_limits(solution, -1e6) is solution.network == network
     alike = replace(town((0.5, 0.5)), default_agents=("import",))
     assert with_supply_limits(bound(alike, min_service=0.999), -1e6) == alike
     nodes = [replace(node, initial=(60.0, 60.0)) if node.id == "ore_a" else node for node in network.nodes]
@@ -281,3 +282,15 @@ def test_limits_of_supplies_prove_nothing_of_worse_episodes(min_service: float) 
         if run.episode_levels[0, 0] >= min_service:
             assert run.episode_circularity[0] <= front.at(run.accounts[:1])[0] + 1e-6
     assert front.is_limited.any()
+
+
+@pytest.mark.medium
+def test_fronts_reach_the_highest_service_that_there_is() -> None:
+    """Ends of what is demanded are those of the network, not those of its limited supplies."""
+    network = replace(corner(), services=(replace(corner().services[0], low=130.0),))
+    sweep = _Sweep(network, ("circularity", "driving"), 3, np.zeros(1), lambda activity, share: None)
+    sweep._programs = _with_ends(network, {"mined_ore": np.full(1, 1.0), "mined_tailings": np.full(1, 1.0)})
+    sweep.run(("circularity", "driving"), {}, np.zeros(1))
+    most = highest_level(network, 0, np.zeros(1))
+    assert np.max(sweep.demands) == pytest.approx(most, abs=1e-5)
+    assert highest_level(sweep._programs, 0, np.zeros(1)) < most - 0.01

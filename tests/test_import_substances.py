@@ -27,6 +27,7 @@ from cirl_marl import (
     load_network,
 )
 from cirl_marl.cli import app
+from cirl_marl.importing import definition
 from cirl_marl.importing.assembly import ImportReport, import_flows
 from cirl_marl.importing.substance_flows import closest_amounts, degrees_of_freedom
 
@@ -489,10 +490,14 @@ def test_a_row_has_its_own_unit(tmp_path: Path) -> None:
 
 def test_flows_of_a_day_are_those_of_a_year(tmp_path: Path) -> None:
     """Networks of tables have years; so have amounts of substances without a unit of their own."""
-    rows = [["Mine", "Dump", 2000, "", 1, "kt/day", ""], ["Mine", "Dump", 2000, "Copper", 0.04, "kt/day", ""]]
+    rows = [["Mine", "Dump", 2000, "", 1, "kt/day", "0.1"], ["Mine", "Dump", 2000, "Copper", 0.04, "kt/day", ""]]
     report = imported(tmp_path, rows)
     assert report.table.unit == "kt/year" and report.table.values == pytest.approx([365.25])
+    assert report.table.deviations == pytest.approx([36.525])
     assert contents_of(tmp_path / "net.toml") == {"mine_to_dump": pytest.approx(0.04)}
+    bare = table(tmp_path / "bare.csv", [[*row[:5], "", row[6]] for row in rows])
+    import_flows(bare, tmp_path / "bare.toml", roles=ROLES, unit="kt/day")
+    assert contents_of(tmp_path / "bare.toml") == {"mine_to_dump": pytest.approx(0.04)}
 
 
 def test_what_mixes_mixes_the_flows_that_were_adjusted(tmp_path: Path) -> None:
@@ -526,7 +531,20 @@ def test_nothing_flows_with_a_content(tmp_path: Path) -> None:
     """A source that gives nothing has none; a content of a flow that is stated to be 0 says nothing."""
     rows = [*sorting(), ["Mine2", "Dump", 2000, "", 0, "kt/year", ""], ["Mine", "Dump", 2000, "", 0, "kt/year", ""]]
     rows.append(["Mine", "Dump", 2000, "Copper", 4, "%", ""])
+    rows += [[*row[:2], 2001, "", 0, "kt/year", ""] for row in rows if not row[3]]
     assert imported(tmp_path, rows).content_error < 1e-9
+    none = import_flows(table(tmp_path / "0.csv", sorting((0, 0, 0))), tmp_path / "none.toml", roles=ROLES)
+    assert none.table.substances is None and "substances" not in (tmp_path / "none.toml").read_text()
+
+
+def test_contents_that_do_not_come_back_are_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A network in which sources that differ were taken for one is not that of the table."""
+    monkeypatch.setattr(definition, "ALIKE", 1e9)
+    rows: list[Row] = [["Mine", end, 2000, "", 10, "kt/year", ""] for end in ("Product", "Dump")]
+    rows += [["Mine", end, 2000, "Copper", part, "%", ""] for end, part in (("Product", 0), ("Dump", 4))]
+    with pytest.raises(CirlError, match=r"does not give back Copper of 'Mine' to '.*' in 2000"):
+        imported(tmp_path, rows)
+    assert not (tmp_path / "net.toml").exists()
 
 
 @pytest.mark.parametrize("name", ["Stock", "Flow"])

@@ -321,15 +321,15 @@ def test_valves_open_for_orders() -> None:
             Node(id="b", initial=(0.0, 0.0)),
             Node(id="c", initial=(0.0, 0.0)),
         ),
-        arcs=tuple(replace(arc, accounts={"cost": -1.0}) for arc in orders),
+        arcs=(replace(orders[0], accounts={"cost": -1.0}), replace(orders[1], accounts={"cost": 2.0})),
         accounts=(Account(id="cost", unit="EUR_2023"),),
         episode=Episode(horizon=4),
     )
     found = bound(network, aim="cost")
-    assert found.objective == pytest.approx(90.0)  # 1.5 times all that is ordered, four times
+    assert found.objective == pytest.approx(60.0)  # 1.5 times what earns, four times, and nothing that costs
     controlled = rollout(MultiAgentVectorEnv(network, num_envs=1), MPC(aim="cost"))
     for run in (simulate_plan(found), controlled):
-        assert -run.accounts[0, 0] == pytest.approx(90.0)
+        assert -run.accounts[0, 0] == pytest.approx(60.0)
 
 
 def test_without_windows_the_plan_of_the_episode_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:

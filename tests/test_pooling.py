@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import pytest
 
 from cirl_marl import Account, Arc, Control, ControlKind, Episode, Law, Network, Node, Service, Substance
 from cirl_marl.network.declarations import positional_record
-from cirl_marl.optimum import bound, improve_plan, simulate_plan
+from cirl_marl.optimum import bound, improve, improve_plan, linearised, simulate_plan, solver
+from cirl_marl.optimum.linearised import StepProgram
 
 
 @positional_record
@@ -155,3 +156,20 @@ def test_plans_solve_pooling_problems(name: str) -> None:
     assert -run.accounts[0, 0] == pytest.approx(problem.optimum, rel=1e-3)
     np.testing.assert_allclose(run.episode_levels[0], 1.0, atol=2e-4)
     assert (run.accounts[0, 1:] <= most * (1 + 1e-5)).all()
+
+
+def test_a_leap_that_fails_is_not_made_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is too impure goes at once or not at all; then its price rises."""
+    leaps, make, values = list[float](), linearised.step_program, solver.best_values
+    are_leaps = list[bool]()
+
+    def observed(*arguments: Any, **options: Any) -> StepProgram:
+        are_leaps.append(options["is_leap"])
+        leaps.extend(arguments[5:6] * are_leaps[-1])
+        return make(*arguments, **options)
+
+    monkeypatch.setattr(improve, "step_program", observed)
+    monkeypatch.setattr(improve, "best_values", lambda *program: None if are_leaps[-1] else values(*program))
+    network = PROBLEMS["Haverly 2"].network()
+    improve_plan(bound(network, aim="cost", at_most={"x": 600.0, "y": 200.0}, min_service=1.0), rounds=40)
+    assert len(leaps) > 1 and set(leaps) == {improve.LEAP}

@@ -314,7 +314,7 @@ class MPC(Planner):
             self._outlooks.pop(copy, None)
         if len(window) == len(rest):
             plan = self._plan(copy, window, demands, last)
-            if last is None or not len(demands.limits) or last.task.intervals.stop != window.stop:
+            if last is None or not len(demands.limits):
                 return plan
             return self._planner.better_of(plan, last.actions[window.start - last.task.intervals.start :])
         if outlook is None and copy not in self._outlooks:
