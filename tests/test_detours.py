@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from benchmarks.generated import market_network, yearly_network
-from cirl_marl import Arc, Control, ControlKind, Episode, Law, MultiAgentVectorEnv, Network, Node, Role, Series
+from cirl_marl import Arc, Control, ControlKind, Episode, Law, MultiAgentVectorEnv, Network, Node, Role, Series, Service
+from cirl_marl.dynamics.arrivals import Arrivals
 from cirl_marl.dynamics.elimination import visits
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.dynamics.static_elimination import SparseRow, StaticElimination, contract_hubs, square_matrix
@@ -186,6 +187,46 @@ def test_columns_of_a_copy_are_passed_as_each_alone(seed: int, passing: int, lea
         np.testing.assert_array_equal(every[:, 2:3, column : column + 1], alone)
     with patch("cirl_marl.dynamics.elimination.kernels_round_products", lambda: False):
         np.testing.assert_array_equal(every[:, [3, 1]], passed(np.array([3, 1]), slice(0, 3)))
+
+
+@given(seed=st.integers(0, 2**31), stores=st.integers(2, 3), passing=st.integers(1, 25), least=st.sampled_from([3, 99]))
+@settings(max_examples=30)
+def test_what_arcs_add_at_once_is_what_comes_through(seed: int, stores: int, passing: int, least: int) -> None:
+    """(I − Pᵀ)⁻¹ of a full matrix, at stocks and flows, whoever is kept or in the core; and copies are as alone."""
+    rng = np.random.default_rng(seed)
+    network = cycle(seed, stores, passing)
+    with crowds(least), keeping(rng.permutation(passing)[: rng.integers(passing + 1)].tolist()):
+        dynamics = Dynamics(network)
+    inside = [arc.id for arc in network.arcs if arc.donor.startswith("m")]
+    services = [Service(id=f"in_{i}", provider=f"s{i}", quantity="stock", low=1.0) for i in range(stores)]
+    services.append(Service(id="both", provider="s0", also=("s1",), quantity="stock", low=1.0))
+    services += [
+        Service(id=arc, provider=arc, quantity="flow", low=1.0) for arc in rng.permutation(inside)[:3].tolist()
+    ]
+    arcs = np.flatnonzero(network.donors < len(network.stores))
+    low, high = dynamics.control_low[:, :1], dynamics.control_high[:, :1]
+    rate = dynamics.rate(low + (high - low) * rng.random((len(low), 3)), np.zeros(3, dtype=np.intp))
+    arrivals = Arrivals(dynamics, services, arcs)
+    result = arrivals(dynamics.routing.routes(rate))
+    np.testing.assert_array_equal(result[:, -1:], arrivals(dynamics.routing.routes(rate[:, 2:].copy())))
+
+    donors, recipients, first = network.donors, network.recipients, len(network.stores)
+    for copy_ in range(3):
+        shares = np.zeros((passing, passing))
+        out = np.flatnonzero(donors >= first)
+        among = out[recipients[out] >= first]
+        np.add.at(shares, (recipients[among] - first, donors[among] - first), rate[among, copy_])
+        visits_ = np.linalg.inv(np.eye(passing) - shares)
+        for n, arc in enumerate(arcs.tolist()):
+            flow = 1.0 * (np.arange(len(network.arcs)) == arc)
+            if recipients[arc] >= first:
+                flow[out] += visits_[donors[out] - first, recipients[arc] - first] * rate[out, copy_]
+            read = []
+            for service in services:
+                at = [network.node_index.get(id_, -1) for id_ in service.providers]
+                inflows = np.isin(recipients, at) & ~np.isin(donors, at)
+                read.append(flow[inflows].sum() if service.quantity == "stock" else flow[network.arc_index[service.id]])
+            np.testing.assert_allclose(result[n, min(copy_, result.shape[1] - 1)], read, rtol=1e-10, atol=1e-14)
 
 
 @given(seed=st.integers(0, 2**31), count=st.integers(1, 9), exponent=st.integers(1, 14))

@@ -265,21 +265,26 @@ def test_nothing_lacks_that_can_be_had_and_nothing_is_supplied_in_vain(seed: int
 
 @pytest.mark.medium
 def test_supplies_cost_few_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two rough guesses and the interval itself are enough for the usual year of steel in Japan."""
+    """Two estimates, by two and by five terms, and the interval itself are the usual year of steel in Japan."""
     env = MultiAgentVectorEnv("steel_japan", num_envs=2)
-    advance, series = env.dynamics.advance, list[int]()
+    advance, estimate, terms = env.dynamics.advance, env.dynamics.estimate, list[int]()
 
-    def counted(*args: Any, **options: Any) -> Any:
-        series.append(options.get("terms") or env.dynamics.terms)
-        return advance(*args, **options)
+    def advance_counted(*args: Any) -> Any:
+        terms.append(env.dynamics.terms)
+        return advance(*args)
+
+    def estimate_counted(*args: Any, **options: Any) -> Any:
+        terms.append(options["terms"])
+        return estimate(*args, **options)
 
     env.reset(seed=0)
-    monkeypatch.setattr(env.dynamics, "advance", counted)
+    monkeypatch.setattr(env.dynamics, "advance", advance_counted)
+    monkeypatch.setattr(env.dynamics, "estimate", estimate_counted)
     rng = np.random.default_rng(0)
     for _ in range(20):
         env.advance(rng.uniform(-1, 1, (len(env.agents), 2)))
-    assert sum(series) <= 2 * 20 * env.dynamics.terms
-    assert series.count(env.dynamics.terms) >= 20
+    assert terms.count(env.dynamics.terms) == 20
+    assert len(terms) == 3 * 20
 
 
 def reserve(stock: float, most: float, demand: float = 47.0, export: float = 0.0) -> Network:

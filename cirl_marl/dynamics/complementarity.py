@@ -42,12 +42,13 @@ def complementary(slope: Floats, shortage: Floats, supply: Floats, most: Floats,
 def _active_set(slope: Floats, shortage: Floats, supply: Floats, most: Floats, arrives: Bools) -> tuple[Floats, Bools]:
     """Return V as ``complementary`` does, shape (B, services), and in which copies it is found.
 
-    All supplies between their bounds are solved for together; then it is changed which these are. A copy for which that
-    comes to no end is left to others.
+    All supplies between their bounds are solved for together; then it is changed which these are, from those that are
+    now. A copy for which that comes to no end is left to others.
     """
     target = shortage + (slope * supply[:, None]).sum(axis=2)
-    pinned_values: Floats
-    free, pinned_values = arrives & (most > 0), np.where(arrives, 0.0, supply)
+    at_bound = np.where(shortage > 0, supply >= most, supply <= 0)  # as if what lacks now lacked still
+    free = arrives & (most > 0) & ~at_bound
+    pinned_values: Floats = np.where(arrives & ~at_bound, 0.0, supply)
     solution, is_solved, unit = supply.copy(), np.zeros(len(supply), dtype=bool), np.eye(supply.shape[1])
     for _ in range(CHANGES):
         left = np.flatnonzero(~is_solved)

@@ -160,13 +160,26 @@ class EliminationOrder:
         return [self._round_of(np.array(pivots), *ways) for pivots, ways in zip(self.pivots, self._ways, strict=True)]
 
     @cached_property
-    def triangles(self) -> tuple[Integers, Triangle, Triangle]:
-        """All rounds in one: the nodes as they are eliminated, what they give on, and what comes back, in reverse."""
+    def factors(self) -> tuple[Integers, _Ways, _Ways]:
+        """The nodes as they are eliminated; by place in this order who gives on to whom, and who gets back from whom.
+
+        The shares themselves are ``EliminatedShares.factors``.
+        """
         nodes = np.concatenate([np.array([*chain(*self.pivots)], dtype=np.intp), self.core])
         place = np.argsort(nodes)
-        (givers, out), (getters, into) = (tuple(map(place.take, self._pairs(side))) for side in (0, 1))
-        back = self.nodes - 1
-        return nodes, Triangle(out, givers, self.nodes), Triangle(back - getters, back - into, self.nodes)
+        (givers, out), (getters, into) = (map(place.take, self._pairs(side)) for side in (0, 1))
+        return nodes, (givers, out), (getters, into)
+
+    @cached_property
+    def triangles(self) -> tuple[Triangle, Triangle]:
+        """All rounds in one: what comes to nodes as they are eliminated; then, in reverse, what passes them.
+
+        The numbers of the one are what is given on, those of the other the inverse pivots and what comes back.
+        """
+        nodes, (givers, out), (getters, into) = self.factors
+        places, size = np.arange(len(nodes)), len(nodes)
+        rows, columns = np.append(places[::-1], size - 1 - getters), np.append(places, 2 * size - 1 - into)
+        return Triangle(out, givers, size), Triangle(rows, columns, size, before=size)
 
     @cached_property
     def transposed_rounds(self) -> list[tuple[RowSum, RowSum]]:
@@ -266,11 +279,25 @@ class EliminatedShares:
             self._visits = visits(shares.reshape(-1, len(core), len(core)), np.ascontiguousarray(values[core].T))
 
     @cached_property
-    def _numbers(self) -> tuple[Floats, Floats, Floats]:
-        """What copies give on, the inverse pivots and what comes back, in the order of ``triangles``, copy by copy."""
-        nodes, ahead, back = self._order.triangles
-        out, into = (np.concatenate([step[side] for step in self._steps]) for side in (1, 2))
-        return ahead.arrange(out), np.ascontiguousarray(self._inverse[nodes].T), back.arrange(into)
+    def _numbers(self) -> tuple[Floats, Floats]:
+        """The numbers of ``triangles``, copy by copy."""
+        nodes, (givers, _), _ = self._order.factors
+        out, into = np.split(self.factors, [len(givers)])
+        ahead, back = self._order.triangles
+        return ahead.arrange(out), back.arrange(np.concatenate([self._inverse[nodes], into]))
+
+    @property
+    def factors(self) -> Floats:
+        """What nodes give on to those eliminated later, then what they get from them, shape (entries, B)."""
+        sides = [[step[side] for step in self._steps] for side in (1, 2)]
+        return np.concatenate([self._inverse[:0], *sides[0], *sides[1]])
+
+    def pass_pivots(self, values: Floats, nodes: Integers) -> Floats:
+        """Return what passes some ``nodes``, the core last, of what comes to each, shape (B, columns, nodes)."""
+        through: Floats = values * self._inverse[nodes].T[:, None]
+        if core := len(self._order.core):
+            through[..., -core:] = values[..., -core:] @ self._visits
+        return through
 
     def of_copies(self, copies: Integers | slice) -> EliminatedShares:
         """Return the eliminated shares of some copies."""
@@ -295,16 +322,14 @@ class EliminatedShares:
         by_copy: Floats = inflow.reshape(len(inflow), batch, inflow.shape[1] // batch)
         if self._steps and kernels_round_products():
             # in two calls; a round takes longer to call than to compute
-            nodes, ahead, back = self._order.triangles
-            out, inverse, into = self._numbers
-            values = np.ascontiguousarray(by_copy.take(nodes, 0).transpose(1, 0, 2))
-            ahead.substitute(out, values)
-            values *= inverse[..., None]
+            nodes, (ahead, back), (out, into) = self._order.factors[0], self._order.triangles, self._numbers
+            values = np.zeros((2, batch, len(nodes), by_copy.shape[2]))
+            values[0] = by_copy.take(nodes, 0).transpose(1, 0, 2)
+            ahead.substitute(out, values[0])
             if core:
-                values[:, -core:] = self._pass_core(values[:, -core:])
-            values = np.ascontiguousarray(values[:, ::-1])
+                values[0, :, -core:] = self._pass_core(values[0, :, -core:])
             back.substitute(into, values)
-            by_copy[nodes] = values[:, ::-1].transpose(1, 0, 2)
+            by_copy[nodes] = values[1, :, ::-1].transpose(1, 0, 2)
             return inflow
 
         def send(total: RowSum, senders: Integers, parts: Floats) -> None:

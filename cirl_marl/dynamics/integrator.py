@@ -94,14 +94,11 @@ class Dynamics(FlowLaws):
         controls: Floats,
         step: Integers | None = None,
         factors: Floats | None = None,
-        *,
         routes: IntervalRoutes | None = None,
-        terms: int | None = None,
     ) -> Transition:
         """Hold ``controls`` for one control interval; arguments are as in ``Transition`` and ``FlowLaws.rate``.
 
-        Who knows the ``routes`` of the interval's shares already gives them. A rough guess takes only so many ``terms``
-        of the exact solver's series; it conserves mass all the same.
+        Who knows the ``routes`` of the interval's shares already gives them.
         In the physical mode scheduled flows are first cut to what their donor can deliver, so the realised flows may be
         lower than those asked for. Networks without time series and batches need no ``step``.
 
@@ -114,12 +111,51 @@ class Dynamics(FlowLaws):
                 f"network '{self.network.name}': advance needs step, the index of the control interval of each copy: "
                 f"time series and batches depend on it, those of arc '{self._needs_step[0]}' for one"
             )
-        rate = actual_rate = self.rate_of_components(stock, controls, step, factors)
+        rate = self.rate_of_components(stock, controls, step, factors)
+        routes = routes or self.routing.routes(rate)
+        stock, inner, total, rate, batch_mass = self._hold(stock, inner, controls, rate, routes, step, None)
+        self._check_finite(stock, inner)
+        flow, _ = self.of_arcs(self._flow_at(stock, inner, controls, rate, routes))
+        return Transition(stock, inner, *self.of_arcs(total), flow, batch_mass)
+
+    def estimate(
+        self,
+        stock: Floats,
+        inner: Floats,
+        controls: Floats,
+        step: Integers,
+        factors: Floats | None,
+        routes: IntervalRoutes | None,
+        *,
+        rate: Floats,
+        terms: int,
+    ) -> tuple[Floats, Floats]:
+        """Return roughly what an interval does, by so many ``terms`` of the exact solver's series; mass is conserved.
+
+        The other arguments are those of ``advance``, and what ``rate`` returns for them, which is used up.
+
+        Returns:
+            stocks after the interval, shape (masses, B), and the mass moved along each arc, shape (arcs, B).
+        """
+        self._limit(rate, stock, step, factors)
+        stock, _, total, *_ = self._hold(stock, inner, controls, rate, routes, step, terms)
+        return stock, self.of_arcs(total)[0]
+
+    def _hold(
+        self,
+        stock: Floats,
+        inner: Floats,
+        controls: Floats,
+        rate: Floats,
+        routes: IntervalRoutes | None,
+        step: Integers | None,
+        terms: int | None,
+    ) -> tuple[Floats, Floats, Floats, Floats, Floats | None]:
+        """Go through an interval; return stocks, inner states, the mass moved, the last rates and what batches do."""
         if self.slots is not None:
             stock = self.slots.shift_slots(stock)
             self.slots.set_outflows(stock, rate)
-        routes = routes or self.routing.routes(rate)
-        batch_start = None
+        actual_rate, batch_start = rate, None
         if self.batches.lines and step is not None:
             stock = stock.copy()
             batch_start = self.batches.dispatch(stock, step)
@@ -141,9 +177,7 @@ class Dynamics(FlowLaws):
             deliveries, batch_end = self.batches.settle(stock, inner, step, self.inner)
             total[self.batches.arcs] = deliveries
             batch_mass = np.stack([batch_start, batch_end])
-        self._check_finite(stock, inner)
-        flow, _ = self.of_arcs(self._flow_at(stock, inner, controls, actual_rate, routes))
-        return Transition(stock, inner, *self.of_arcs(total), flow, batch_mass)
+        return stock, inner, total, actual_rate, batch_mass
 
     def of_arcs(self, flow: Floats) -> tuple[Floats, Floats]:
         """Return what the arcs of the network carry, of all that is moved, shape (arcs of the simulator, B).
@@ -179,10 +213,16 @@ class Dynamics(FlowLaws):
         self, stock: Floats, controls: Floats, step: Integers | None, factors: Floats | None
     ) -> Floats:
         """Return what ``rate_within_capacities`` does, of components where sources state what they give of each."""
-        rate = self.rate_within_capacities(stock, controls, step, factors)
+        rate = self.rate(controls, step, factors)
+        self._limit(rate, stock, step, factors)
+        return rate
+
+    def _limit(self, rate: Floats, stock: Floats, step: Integers | None, factors: Floats | None) -> None:
+        """Cut rates to what capacities let them carry, and share them out among components, in place."""
+        if self.capacities:
+            self.capacities.cut(rate, stock, step, factors)
         if self.source_contents:
             self.source_contents.share_out(rate, step, factors)
-        return rate
 
     def _check_finite(self, stock: Floats, inner: Floats) -> None:
         if np.isfinite(stock).all() and np.isfinite(inner).all():

@@ -118,7 +118,8 @@ class Routing:
         on = np.flatnonzero((self.places[self.donors] >= early) & (self.ends < self.nodes))
         on = on[self.places[self.ends[on]] < early]
         self._on, self._on_from = self.arcs[on], self.places[self.donors[on]] - early
-        self._on_to = RowSum(self.places[self.ends[on]], range(len(on)), 1.0, (self.nodes, len(on)))
+        self._on_ends = self.places[self.ends[on]]
+        self._on_to = RowSum(self._on_ends, range(len(on)), 1.0, (self.nodes, len(on)))
 
     def _compile_shares(self, shares: Floats) -> None:
         """Write the shares between kept nodes as weighted sums of the shares of arcs."""
@@ -188,20 +189,29 @@ class Routing:
         It is the transpose of ``throughputs``: the worth of throughputs stands in the rows of its result, and is used
         up. Shapes are (nodes, B).
         """
-        ahead, among, back = (matrix.transpose(reverse=True) for matrix in (self._ahead, self._among, self._back))
         early, late = self._early, slice(self._early.stop, self.nodes)
-        worth = back.substitute(worth[::-1].copy())[::-1]
-        through = np.zeros_like(worth)
-        through[early] = (worth[early] * self._inverse)[::-1]
-        through = among.substitute(through[::-1].copy())[::-1]
+        through = self.constant_worths(worth)
         if late.start < late.stop:
             kept_rows = self._on_sum.add_to(
                 worth.copy(), self._on_to.transpose()(through.copy()) * routes.rate.take(self._on, 0)
             )
             kept_rows[early] = 0.0
             kept_rows[late] = routes.kept_nodes.worth(kept_rows[late])
-            through = through + ahead.substitute(kept_rows[::-1].copy())[::-1]
+            through = through + self._ahead.transpose(reverse=True).substitute(kept_rows[::-1].copy())[::-1]
         return through
+
+    def constant_worths(self, worth: Floats) -> Floats:
+        """Return the part of ``worths`` that is due to ways past constant nodes alone."""
+        among, back = (matrix.transpose(reverse=True) for matrix in (self._among, self._back))
+        worth = back.substitute(worth[::-1].copy())[::-1]
+        through = np.zeros_like(worth)
+        through[self._early] = (worth[self._early] * self._inverse)[::-1]
+        return among.substitute(through[::-1].copy())[::-1]
+
+    @property
+    def return_arcs(self) -> tuple[Integers, Integers, Integers]:
+        """Arcs from kept to constant nodes, which of the kept nodes they leave, and the place of what they enter."""
+        return self._on, self._on_from, self._on_ends
 
     def most(self, flow: Floats) -> Floats:
         """Return upper bounds of the throughputs if flows that enter are at most ``flow``, shape (arcs,).

@@ -80,8 +80,7 @@ class SupplyAdjoint:
         per_extent = np.where(idle & (amount > low) & (amount < high), supply.weights, 0.0)
         rate = dynamics.rate(inputs.controls, step, inputs.factors)
         services = len(supply.demand)
-        every = np.arange(services)[:, None].repeat(rate.shape[1], 1)
-        slope = supply.arrivals(rate, dynamics.routing.routes(rate), per_extent, every) * supply.duration
+        slope = supply.slope(supply.arrivals(dynamics.routing.routes(rate)), per_extent) * supply.duration
         least = TINY * dynamics.network.episode.control_interval * supply.total(per_extent)
         is_free = np.diagonal(slope, axis1=1, axis2=2) > least.T
         per_extent *= is_free.T[supply.of]

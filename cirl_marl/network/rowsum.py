@@ -46,12 +46,13 @@ class Triangle:
     """Where the entries of a strictly lower triangular matrix stand; the numbers are given in each use, for each copy.
 
     The rows are gone through in their order, and in a row the entries as they were given. All copies are worked on in
-    one call, as blocks of one matrix: so many short rows that wait for each other would take longer to call for.
+    one call, as blocks of one matrix: so many short rows that wait for each other would take longer to call for. The
+    first columns may be those of rows that stand ``before`` them and stay as they are.
     """
 
-    def __init__(self, rows: Integers, columns: Integers, size: int) -> None:
-        """Take the places of the entries."""
-        self._size, self._order = size, np.argsort(rows, kind="stable")
+    def __init__(self, rows: Integers, columns: Integers, size: int, before: int = 0) -> None:
+        """Take the places of the entries in so many rows."""
+        self._size, self._before, self._order = size, before, np.argsort(rows, kind="stable")
         self._columns = columns[self._order]
         self._ends: Integers = np.cumsum(np.bincount(rows, minlength=size))
         self._blocks: dict[int, tuple[Integers, Integers]] = {}
@@ -61,17 +62,29 @@ class Triangle:
         return np.ascontiguousarray(numbers.take(self._order, 0).T)
 
     def substitute(self, numbers: Floats, values: Floats) -> None:
-        """Replace ``values``, shape (B, rows, n), by (I − W)⁻¹ values, as ``RowSum.substitute`` does."""
-        batch, _, each = values.shape
+        """Replace ``values``, n for each row, by (I − W)⁻¹ values, as ``RowSum.substitute`` does.
+
+        In the C-contiguous array stand the rows before of all copies, copy by copy, then the rows of all.
+        """
+        batch = len(numbers)
         if batch not in self._blocks:
-            copies = np.arange(batch, dtype=np.intp)[:, None]
-            starts = np.append(0, self._ends + copies * len(self._columns))
-            self._blocks[batch] = starts, (self._columns + copies * self._size).ravel()
-        rows, flat, entries = batch * self._size, values.reshape(-1), (*self._blocks[batch], numbers.reshape(-1))
+            self._blocks[batch] = self._block(batch)
+        rows, columns = batch * self._size, batch * (self._before + self._size)
+        flat, entries = values.reshape(-1), (*self._blocks[batch], numbers.reshape(-1))
+        each = len(flat) // max(columns, 1)
+        result = flat[batch * self._before * each :]
         if each == 1:
-            csr_matvec(rows, rows, *entries, flat, flat)
+            csr_matvec(rows, columns, *entries, flat, result)
         else:
-            csr_matvecs(rows, rows, each, *entries, flat, flat)
+            csr_matvecs(rows, columns, each, *entries, flat, result)
+
+    def _block(self, batch: int) -> tuple[Integers, Integers]:
+        """Return where each row of all copies begins, and the columns of its entries."""
+        copies = np.arange(batch, dtype=np.intp)[:, None]
+        starts = np.append(0, self._ends + copies * len(self._columns))
+        later = (batch - 1) * self._before + copies * self._size
+        shifts = np.where(self._columns < self._before, copies * self._before, later)
+        return starts, (self._columns + shifts).ravel()
 
 
 @cache
