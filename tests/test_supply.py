@@ -307,6 +307,23 @@ def reserve(stock: float, most: float, demand: float = 47.0, export: float = 0.0
     )
 
 
+def test_what_a_correction_brought_tells_how_the_next_one_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A twentieth of what is supplied has left the product again at the end; one interval in full is enough."""
+    env = MultiAgentVectorEnv(reserve(1e6, 1e4), num_envs=1)
+    env.reset(seed=0)
+    advance, intervals = env.dynamics.advance, list[int]()
+
+    def advance_counted(*args: Any) -> Any:
+        intervals.append(1)
+        return advance(*args)
+
+    monkeypatch.setattr(env.dynamics, "advance", advance_counted)
+    state, idle = env.physical, np.ones((1, 1), dtype=bool)
+    done = env.supply.advance(state.stock, state.inner, env.controls, state.step, idle)[1]
+    np.testing.assert_allclose(env.rows.stocks(done.stock)[1], 47.0, rtol=1e-9)
+    assert len(intervals) == 1
+
+
 @pytest.mark.parametrize("most", [50.0, 1e4, 1e7])
 @pytest.mark.parametrize(("stock", "export"), [(12.0, 0.0), (1000.0, 0.0), (120.0, 10.0)])
 def test_a_small_reserve_gives_no_more_than_is_needed(stock: float, export: float, most: float) -> None:

@@ -15,7 +15,7 @@ its level falls short.
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Container, Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -33,12 +33,12 @@ CLOSE = 3e-10
 """Distance of what is measured from what is demanded, relative to that, at which nothing lacks."""
 ROUNDS = 12
 """Most corrections."""
-LEVELS = ((2, np.inf, 1), (5, 6e-6, 5), (None, 0.0, ROUNDS + 1))
-"""Terms of the solver's series by which intervals are estimated until no more than a part of the demand lacks, as what
-is left then after one more correction is little; and most of them. The last are simulated in full."""
+LEVELS = ((2, 2e-2, 2), (6, 2e-5, 5), (None, 0.0, ROUNDS + 1))
+"""Terms of the solver's series by which intervals are estimated; part of the demand below which what lacks will be
+little after one more correction; and most of these intervals. The last ones are simulated in full."""
 CELLS = 80_000
 """Most masses of all copies together that are worked on at once; more do not stay in a cache."""
-NOTICEABLE = 1e-3, 1e-7
+NOTICEABLE = 3e-3, 1e-7
 """Part of what is demanded, beyond which what a correction has brought about tells how the next one will do: between
 intervals with other numbers of terms, and with the same."""
 
@@ -262,17 +262,14 @@ class SupplyRange:
         return np.divide(self.weights, per_extent, out=np.zeros_like(self.weights), where=has_room)
 
 
-def _of_copies(copies: Integers, *arrays: Any) -> list[Any]:
-    """Return some copies of arrays whose last axis they are, or of routes; the same arrays if these are all."""
-    parts = []
-    for array in arrays:
-        if array is None or (isinstance(array, np.ndarray) and array.shape[-1] == len(copies)):
-            parts.append(array)
-        elif isinstance(array, np.ndarray):
-            parts.append(array.take(copies, axis=-1))
-        else:
-            parts.append(array.of_copies(copies))
-    return parts
+def _of_copies(copies: Integers, *arrays: Any) -> Sequence[Any]:
+    """Return some copies of arrays whose last axis they are, and of routes; the same if these are all."""
+    if len(copies) == arrays[0].shape[-1]:
+        return arrays
+    return [
+        array.take(copies, axis=-1) if isinstance(array, np.ndarray) else array and array.of_copies(copies)
+        for array in arrays
+    ]
 
 
 def _with_copies(done: Transition, copies: Integers, part: Transition) -> Transition:
