@@ -84,7 +84,16 @@ def booked(network: Network, seed: int, *, credits: bool = True) -> Network:
 
     nodes = tuple(replace(n, accounts=rates(), holding=rates() if n.stores else {}) for n in network.nodes)
     arcs = tuple(replace(a, accounts=rates()) for a in network.arcs)
+    nodes, arcs = (tuple(_with_effort(part, rng) for part in parts) for parts in (nodes, arcs))
     return replace(network, nodes=nodes, arcs=arcs, accounts=ACCOUNTS, scenarios={})
+
+
+def _with_effort(part: Any, rng: np.random.Generator) -> Any:
+    """Return a node or an arc whose control, if it has one that is ever neutral, costs a random effort or none."""
+    rate = float(10 * abs(rng.normal()))
+    if part.control is None or (isinstance(part, Arc) and part.makes_up_for) or rng.random() < 0.3:
+        return part
+    return replace(part, effort={"cost": rate, **({"emissions": 0.1 * rate} if rng.random() < 0.5 else {})})
 
 
 def with_lambda(network: Network) -> Network:

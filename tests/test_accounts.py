@@ -90,10 +90,14 @@ def test_every_view_books_the_same(seed: int, nodes: int, arcs: int, lifetimes: 
     env, steps = MultiAgentVectorEnv(network, num_envs=3), network.episode.horizon
     run = rollout(env, Random(), seed=seed)
     ledger = Ledger(network)
-    by_flow, by_stock = ledger.rates()
+    tables = ledger.rates()
     stock = np.concatenate([run.start[None], run.stock])
-    totals = (by_flow * run.flow).sum(axis=(1, 2)) + (by_stock * (stock[1:] + stock[:-1]) / 2).sum(axis=(1, 2))
-    size = (abs(by_flow) * run.flow).sum(axis=(1, 2)) + (abs(by_stock) * (stock[1:] + stock[:-1]) / 2).sum(axis=(1, 2))
+    effort = abs(run.controls - network.control_bounds[1].T)[:, : tables[2].shape[2]]
+    measures = (run.flow, (stock[1:] + stock[:-1]) / 2, effort)
+    totals, size = (
+        sum((rates * measure).sum(axis=(1, 2)) for rates, measure in zip(parts, measures, strict=True))
+        for parts in (tables, [abs(table) for table in tables])
+    )
     np.testing.assert_allclose(run.accounts[0], totals, atol=float(1e-12 * size.max(initial=1.0)))
     np.testing.assert_array_equal(ledger.sums(run.entries.T).T, run.bookings[0].T)
     alone, among = (rollout(MultiAgentVectorEnv(network, num_envs=n), Neutral(), seed=seed) for n in (1, 3))

@@ -166,7 +166,7 @@ class Converter:
             return tuple(map(tuple, entry))
         return tuple(entry) if isinstance(entry, list) else entry
 
-    def _named_value(self, declaration: Rates, id_: str, entry: Any, path: str) -> Value:
+    def _named_value(self, declaration: Rates, id_: str, entry: Any, path: str, control_unit: str = "1") -> Value:
         """Return what is charged on an account, or a part of a substance."""
         tables: Any = getattr(self.table, f"{declaration.of}s")
         if id_ not in tables:
@@ -175,8 +175,8 @@ class Converter:
         if declaration.of == "substance":
             return self._value(entry, "1", f"{path}.{id_}")
         units = self.table.units
-        per = f"({units.mass})" if declaration.per == "mass" else f"(({units.mass})*({units.time}))"
-        return self._value(entry, f"({tables[id_].unit})/{per}", f"{path}.{id_}")
+        unit = declaration.unit(tables[id_].unit, units.mass, units.time, control_unit)
+        return self._value(entry, unit, f"{path}.{id_}")
 
     def _record(self, entry: RecordColumn, path: str) -> tuple[float, ...]:
         texts = {key: self._with_region(text, f"{path}.where.{key}") for key, text in entry.where.items()}
@@ -191,7 +191,13 @@ class Converter:
     def _compartment(self, record: type[Node] | type[Arc], id_: str, table: Any, path: str) -> Any:
         """Return a node or an arc, whose control depends on its model, with the scale of all that state none."""
         fields = {"id": id_, **self._model(table.model, f"{path}.model")}
-        fields |= {"model": fields.get("model"), "control": self._control(table.control, fields.get("model"), path)}
+        model = fields.get("model")
+        fields |= {"model": model, "control": self._control(table.control, model, path)}
+        unit = "1" if table.control is None else self._control_unit(table.control, model) or "1"
+        effort = table.effort.items()
+        fields["effort"] = {
+            id_: self._named_value(elements.EFFORT, id_, value, f"{path}.effort", unit) for id_, value in effort
+        }
         if record is Arc:
             self._check_law(table, path)
         if table.scale is None:
@@ -254,8 +260,7 @@ class Converter:
         path = f"{path}.control"
         if control is None:
             return None
-        native_unit = control.unit if model is None else model.input_unit
-        target = {ControlKind.FLOW: "flow", ControlKind.INPUT: native_unit}.get(control.kind, "1")
+        target = self._control_unit(control, model)
         if target is None and model is not None and control.unit != "1":
             remedy = "give its class one, or write unit = '1' and the numbers as the model takes them"
             fault = f"unit '{control.unit}': model '{model.kind}' states no input_unit to convert to"
@@ -276,6 +281,11 @@ class Converter:
         ):
             self.uncertain[path] = replace(self.uncertain[path], high=1 / most)  # no share is more than 1
         return result
+
+    def _control_unit(self, control: Any, model: CompartmentModel | None) -> str | None:
+        """Return the unit that values of a control are converted to; None if its model states none."""
+        native_unit = control.unit if model is None else model.input_unit
+        return {ControlKind.FLOW: self.targets["flow"], ControlKind.INPUT: native_unit}.get(control.kind, "1")
 
     def _number(self, quantity: Any, kind: str, path: str) -> float:
         value = self._value(quantity, kind, path)

@@ -41,7 +41,7 @@ def fingerprint(network: Network) -> str:
     document.pop("accounts", None)  # what is booked changes nothing that moves
     for kind in ("nodes", "arcs", "services"):
         for part in document[kind].values():
-            for key in ("title", "accounts", "holding"):
+            for key in ("title", "accounts", "effort", "holding"):
                 part.pop(key, None)
     return hashlib.sha256(json.dumps(document, default=str).encode()).hexdigest()
 
@@ -133,7 +133,7 @@ class _Writer:
                 table |= {key: float(value), "unit": unit_, "source": SOURCE}
             elif isinstance(declaration, declarations.Rates):
                 table[key] = {
-                    id_: self._number(number, f"{path}.{name}.{id_}", self._named_unit(declaration, id_))
+                    id_: self._number(number, f"{path}.{name}.{id_}", self._named_unit(declaration, id_, part))
                     for id_, number in value
                 }
             elif isinstance(declaration, declarations.Quantity):
@@ -166,20 +166,21 @@ class _Writer:
         number = self._quantity(value, "1") | {"unit": unit} | _spread_keys(self._network.uncertain.get(path), value)
         return number | self._disturbance_keys(path)
 
-    def _named_unit(self, declaration: declarations.Rates, id_: str) -> str:
+    def _named_unit(self, declaration: declarations.Rates, id_: str, part: Compartment) -> str:
         if declaration.of == "substance":
             return "1"
         units = {account.id: account.unit for account in self._network.accounts}
-        per = f"({self._units['mass']})"
-        per = per if declaration.per == "mass" else f"({per}*({self._units['time']}))"
-        return f"({units[id_]})/{per}"
+        return declaration.unit(units[id_], self._units["mass"], self._units["time"], self._control_unit(part))
+
+    def _control_unit(self, part: Compartment) -> str:
+        control = part.control
+        if control is not None and control.kind is ControlKind.INPUT and part.model is not None:
+            return part.model.input_unit or "1"
+        return self._units["flow"] if control is not None and control.kind is ControlKind.FLOW else "1"
 
     def _control(self, part: Compartment) -> dict[str, Any]:
-        control = part.control
+        control, unit = part.control, self._control_unit(part)
         assert isinstance(control, Control)
-        unit = self._units["flow"] if control.kind is ControlKind.FLOW else "1"
-        if control.kind is ControlKind.INPUT and part.model is not None:
-            unit = part.model.input_unit or "1"
         sides = {"low": control.low, "neutral": control.neutral, "high": control.high}
         bounds = {side: self._series(at) if isinstance(at, Series) else float(at) for side, at in sides.items()}
         substances = {"substances": list(control.substances)} if control.substances else {}

@@ -1,8 +1,9 @@
-"""What an interval costs, emits or needs: amounts on accounts, read off mean flows and stocks.
+"""What an interval costs, emits or needs: amounts on accounts, read off mean flows, stocks and controls.
 
 An interval of length h books a·f̄·h for each mass that flows along an arc, or enters a node, and b·(x + x')/2·h for
 what a node holds, x and x' being its stock at the start and at the end. Both are linear in flows and stocks, so that
-programs bound them exactly. Nothing that is booked changes what moves.
+programs bound them exactly. For a control u that is not at its neutral value n it books e·|u − n|·h, which is convex
+(``optimum.effort``). Nothing that is booked changes what moves.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ class Ledger:
         compartments: id of the compartment that each entry is of.
         account: position of the account of each entry, shape (entries,).
         discount: by which amounts of each interval are multiplied in totals, shape (accounts, horizon).
+        has_efforts: whether anything is booked for controls.
     """
 
     def __init__(self, network: Network, ranges: Mapping[str, tuple[float, float]] | None = None) -> None:
@@ -36,24 +38,27 @@ class Ledger:
         inflows: list[list[int]] = [[] for _ in network.nodes]
         for k, recipient in enumerate(network.recipients.tolist() if self.accounts else ()):
             inflows[recipient].append(k)
-        arcs, entries = len(network.arcs), []
+        arcs, stores, entries = len(network.arcs), len(network.stores), []
         groups = (("nodes", network.nodes), ("arcs", network.arcs)) if self.accounts else ()
         for kind, parts in groups:
             for i, part in enumerate(parts):
                 for name, declaration in declarations(type(part)).items():
                     if not isinstance(declaration, Rates) or declaration.of != "account":
                         continue
-                    holds = declaration.per == "stock"
-                    charged = [arcs + i] if holds else inflows[i] if kind == "nodes" else [i]
+                    subjects = {"mass": inflows[i] if kind == "nodes" else [i], "stock": [arcs + i]}
+                    if declaration.per == "control" and part.control is not None:
+                        rows = network.control_rows[part.id]
+                        subjects["control"] = [arcs + stores + row for row in range(rows.start, rows.stop)]
                     for account, rate in getattr(part, name):
-                        path = f"{kind}.{part.id}.{name}.{account}"
-                        entries.append((part.id, self.accounts.index(account), charged, rate, numbers.get(path)))
+                        path, place = f"{kind}.{part.id}.{name}.{account}", self.accounts.index(account)
+                        entries.append((part.id, place, subjects[declaration.per], rate, numbers.get(path)))
         self.compartments = tuple(entry[0] for entry in entries)
         self.account: Integers = np.array([entry[1] for entry in entries], dtype=np.intp)
         places = [(row, column) for row, entry in enumerate(entries) for column in entry[2]]
-        rows, columns = np.array(places, dtype=np.intp).reshape(-1, 2).T
-        self._charged = RowSum(rows, columns, 1.0, (len(entries), arcs + len(network.stores)))
-        self._places = rows, columns
+        rows_of_entries, columns = self._places = np.array(places, dtype=np.intp).reshape(-1, 2).T
+        self.has_efforts = bool((columns >= arcs + stores).any())
+        controls = network.control_bounds.shape[1] if self.has_efforts else 0
+        self._charged = RowSum(rows_of_entries, columns, 1.0, (len(entries), arcs + stores + controls))
         self._by_account = RowSum(self.account, range(len(entries)), 1.0, (len(self.accounts), len(entries)))
         horizon = network.episode.horizon
         rates = [network.interval_means(entry[3]) for entry in entries]
@@ -66,7 +71,13 @@ class Ledger:
         self.discount: Floats = growth**-middle
 
     def entries(
-        self, flow: Floats, before: Floats, after: Floats, step: Integers, factors: Floats | None = None
+        self,
+        flow: Floats,
+        before: Floats,
+        after: Floats,
+        deviation: Floats | None,
+        step: Integers,
+        factors: Floats | None = None,
     ) -> Floats:
         """Return the amount of each entry in the interval ``step`` of each copy, not discounted, shape (entries, B).
 
@@ -74,12 +85,17 @@ class Ledger:
             flow: mean flows, shape (arcs, B), mass/time.
             before: stocks at the start, shape (stores, B), mass.
             after: stocks at the end, likewise.
+            deviation: of the controls from their neutral values, shape (controls, B); None without ``has_efforts``.
             step: the interval, shape (B,).
             factors: those on numbers that are not certain, shape (numbers, B).
         """
         rates = self._factors(self._rates_in(step), factors)
-        amounts: Floats = self._charged(np.concatenate([flow, (before + after) / 2])) * rates * self._interval
+        amounts: Floats = self._amounts(flow, (before + after) / 2, deviation) * rates * self._interval
         return amounts
+
+    def _amounts(self, flow: Floats, stock: Floats, deviation: Floats | None) -> Floats:
+        """Return what each entry is charged for, shape (entries, B)."""
+        return self._charged(np.concatenate([flow, stock] if deviation is None else [flow, stock, abs(deviation)]))
 
     def _rates_in(self, step: Integers) -> Floats:
         """Return the rate of each entry in the interval ``step`` of each copy, as it is stated."""
@@ -90,36 +106,41 @@ class Ledger:
         adjoint: Floats,
         flow: Floats,
         stock: Floats,
+        deviation: Floats | None,
         step: Integers,
         factors: Floats | None,
         factor_adjoint: Floats | None,
-    ) -> tuple[Floats, Floats]:
-        """Return derivatives by mean flows and by mean stocks of those by discounted amounts, (accounts, B).
+    ) -> tuple[Floats, Floats, Floats | None]:
+        """Return derivatives by mean flows, mean stocks and controls of those by discounted amounts, (accounts, B).
 
-        Those by the factors on rates are added to ``factor_adjoint``.
+        That of a distance is 0 where a control is neutral. Those by the factors on rates are added to
+        ``factor_adjoint``.
         """
         rates = self._rates_in(step)
         per_entry = (adjoint * self.discount.take(step, axis=1)).take(self.account, axis=0) * self._interval
         if factors is not None and factor_adjoint is not None:
-            table = np.broadcast_to(rates, per_entry.shape) * self._charged(np.concatenate([flow, stock]))
+            table = np.broadcast_to(rates, per_entry.shape) * self._amounts(flow, stock, deviation)
             self._factors.pull_back(table, per_entry, factor_adjoint)
         by_charged = self._charged.transpose()(per_entry * self._factors(rates, factors))
-        return by_charged[: len(flow)], by_charged[len(flow) :]
+        by_flow, by_stock, by_distance = np.split(by_charged, [len(flow), len(flow) + len(stock)])
+        return by_flow, by_stock, None if deviation is None else by_distance * np.sign(deviation)
 
     def sums(self, entries: Floats) -> Floats:
         """Return the amount on each account, shape (accounts, B), of those of entries."""
         return self._by_account(entries)
 
-    def rates(self, *, with_discount: bool = True) -> tuple[Floats, Floats]:
-        """Return what totals have of mean flows and of mean stocks of each interval.
+    def rates(self, *, with_discount: bool = True) -> tuple[Floats, Floats, Floats]:
+        """Return what totals have of mean flows, of mean stocks and of distances of controls in each interval.
 
-        Shapes are (accounts, horizon, arcs) and (accounts, horizon, stores), in amounts per mass/time and per mass.
+        Shapes are (accounts, horizon, arcs), (accounts, horizon, stores) and, without ``has_efforts`` none of which
+        there are, (accounts, horizon, controls), in amounts per mass/time, per mass and per unit of the control.
         """
         horizon, arcs = self.discount.shape[1], len(self._network.arcs)
+        stocks = slice(arcs, arcs + len(self._network.stores))
         table = np.zeros((len(self.accounts), horizon, self._charged.shape[1]))
         rows, columns = self._places
         rates = np.broadcast_to(self._rates, (len(self._rates), horizon))
         for row, column in zip(rows.tolist(), columns.tolist(), strict=True):
             table[self.account[row], :, column] += rates[row]
         table *= ((self.discount if with_discount else np.ones_like(self.discount)) * self._interval)[:, :, None]
-        return table[..., :arcs], table[..., arcs:]
+        return table[..., :arcs], table[..., stocks], table[..., stocks.stop :]

@@ -15,6 +15,8 @@ from cirl_marl.errors import CirlError, ControlError, unknown_name
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.rowsum import single_column, spans
 
+ROUNDING = 1e-12
+"""Part of its largest value by which a control that is neutral may miss that, by the rounding of its action."""
 BOUND = 1.0 + 1e-6
 """Largest action taken: wrappers that rescale actions do so in single precision and may land a rounding beyond 1."""
 
@@ -51,6 +53,8 @@ class Actuators:
         self._drawn = ControlFactors(network, ranges, self.control_rows)
         self._all_drawn = ControlFactors(network, ranges)
         low, neutral, high = (single_column(bound) for bound in network.control_bounds)
+        sizes = np.maximum(abs(low), abs(high)).max(axis=1, initial=0.0, keepdims=True)
+        self._rounding: Floats = ROUNDING * sizes
         capacities, highest = capacity_numbers(network, ranges), high
         self._all_capacities = RowFactors(capacities)
         self._capacities = RowFactors(
@@ -122,6 +126,11 @@ class Actuators:
         controls[self.control_rows] = values
         return controls
 
+    def deviation(self, controls: Floats, step: Integers, factors: Floats | None = None) -> Floats:
+        """Return by how much controls are away from their neutral values, but for rounding, shape (controls, B)."""
+        difference = controls - self._neutral_in(step, factors)
+        return np.where(np.abs(difference) <= self._rounding, 0.0, difference)
+
     def pull_back(
         self, actions: Floats, step: Integers, factors: Floats | None, adjoint: Floats
     ) -> tuple[Floats, Floats]:
@@ -165,6 +174,20 @@ class Actuators:
         entry, copy_ = np.argwhere(wrong)[0]
         agent = next(agent for agent, entries in self.entries.items() if entries.start <= entry < entries.stop)
         return f"action of agent '{agent}' in copy {copy_} is {actions[entry, copy_]}; it must be a number in [-1, 1]"
+
+
+def planned_deviation(network: Network, agents: Sequence[str], actions: Floats, first: int = 0) -> Floats:
+    """Return by how much controls are away from their neutral values under planned actions, (controls, intervals).
+
+    Args:
+        network: certain.
+        agents: who acts; none stands for the network's own choice.
+        actions: stacked, shape (intervals, entries).
+        first: the interval in which they begin.
+    """
+    steps = np.arange(first, first + len(actions))
+    actuators = Actuators(network, agents or None, len(actions))
+    return actuators.deviation(actuators.controls(np.ascontiguousarray(actions.T), steps), steps)
 
 
 def action_array(agent: str, action: ArrayLike) -> NDArray[Any]:

@@ -87,19 +87,28 @@ class Derivatives:
             by_quantity += by_seen
         by_flow = by_quantity[signals.flows] + network.circularity_adjoint(after.flow) * adjoint.circularity
         by_flow += network.throughput_adjoint(by_quantity[signals.throughputs])
-        by_stock, by_start = by_quantity[signals.stocks], None
+        by_stock, by_start, by_control = by_quantity[signals.stocks], None, None
         if adjoint.accounts is not None and env.ledger.accounts:
             held = (env.rows.stocks(before.stock) + env.rows.stocks(after.stock)) / 2
-            bookings = env.ledger.pull_back(adjoint.accounts, after.flow, held, step, factors, factor_adjoint)
+            deviation = None
+            if env.ledger.has_efforts:
+                controls = env.actuators.controls(interval.actions, step, factors)
+                deviation = env.actuators.deviation(controls, step, factors)
+            bookings = env.ledger.pull_back(
+                adjoint.accounts, after.flow, held, deviation, step, factors, factor_adjoint
+            )
             by_flow += bookings[0]
-            by_start = bookings[1] / 2
+            by_start, by_control = bookings[1] / 2, bookings[2]
             by_stock = by_stock + by_start
         by_substance, by_its_flow = env.substance_masses.pull_back(by_quantity[signals.substances])
         stock = adjoint.stock + env.rows.masses_adjoint(by_stock, by_substance)
         inputs = IntervalInputs(before.stock, interval.controls, factors)
         length = network.episode.control_interval
         result = self._supply.pull_back(inputs, step, env.idle, stock, by_flow / length, by_its_flow / length)
-        actions, ends = env.actuators.pull_back(interval.actions, step, factors, result.controls)
+        controls_adjoint = result.controls if by_control is None else result.controls + by_control
+        actions, ends = env.actuators.pull_back(interval.actions, step, factors, controls_adjoint)
+        if by_control is not None:
+            ends[1] -= by_control  # the distance is from the neutral value
         draws = np.zeros_like(before.factors)
         if factors is not None and factor_adjoint is not None and result.factors is not None:
             factor_adjoint += result.factors

@@ -428,6 +428,7 @@ class MultiAgentVectorEnv:
             raise ControlError(f"the episode is over after {horizon} steps: call reset()")
         factors = self.factors_in(state.step)
         controls = self.actuators.controls(actions, state.step, factors)
+        deviation = self.actuators.deviation(controls, state.step, factors) if self.ledger.has_efforts else None
         controls, transition = self.supply.advance(state.stock, state.inner, controls, state.step, self.idle, factors)
         self.controls = controls
         quantities, flow = self._measure(transition, controls)
@@ -440,7 +441,7 @@ class MultiAgentVectorEnv:
         entries = bookings = accounts = state.accounts
         if self.ledger.accounts:
             before, after = self.rows.stocks(state.stock), self.rows.stocks(transition.stock)
-            entries = self.ledger.entries(flow, before, after, state.step, factors)
+            entries = self.ledger.entries(flow, before, after, deviation, state.step, factors)
             bookings = self.ledger.sums(entries)
             accounts = accounts + bookings * self.ledger.discount.take(state.step, axis=1)
         amounts = accounts - state.accounts

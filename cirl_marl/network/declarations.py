@@ -178,9 +178,17 @@ class Numbers(Declaration):
 class Rates(Declaration):
     """Numbers by name: one for each of some accounts, in the unit of the account per ``per``, or of some substances."""
 
-    per: Annotated[str, "what an amount is charged for: ``mass``, or ``stock``, which is mass · time"] = "mass"
+    per: Annotated[
+        Literal["mass", "stock", "control"],
+        "what an amount is charged for: ``mass``, a ``stock`` and time, or a ``control``, in its unit, and time",
+    ] = "mass"
     of: Annotated[Literal["account", "substance"], "what has the names"] = "account"
     number: Annotated[Quantity, "what each of them is"] = RATE
+
+    def unit(self, amount: str, mass: str, time: str, control: str) -> str:
+        """Return the unit of amounts of some unit per what they are charged for, in the units of a network."""
+        per = {"mass": f"({mass})", "stock": f"(({mass})*({time}))", "control": f"(({control})*({time}))"}
+        return f"({amount})/{per[self.per]}"
 
     def problem(self, value: object) -> str:
         """See ``Declaration.problem``."""

@@ -197,6 +197,11 @@ CONTENT = Quantity("a part of the mass", low=0.0, high=1.0, varies=True)
 RATES = Rates(
     "amounts by account, per mass that flows along an arc or enters a node; negative ones are revenues or credits"
 )
+EFFORT = Rates(
+    "amounts by account, per unit of what its control is away from its neutral value, and time",
+    per="control",
+    number=NotNegative("an amount on an account", of="own", varies=True),
+)
 LIFETIME = Subtable("how long what enters stays, for arcs of law ``share`` to split what leaves", of="lifetime")
 CONTROL = Subtable("its actuator; None if it cannot act")
 RULE = Subtable(
@@ -224,6 +229,7 @@ class Compartment(CheckedRecord):
     rule: Annotated[FeedbackRule | None, RULE] = None
     model: Annotated[CompartmentModel | None, MODEL] = None
     accounts: Annotated[NamedValues, RATES] = ()
+    effort: Annotated[NamedValues, EFFORT] = ()
     inner: Annotated[tuple[Pair, ...], INNER] = ()
     reward_scale: Annotated[float, Positive("the model's reward is divided by it")] = 1.0
 
@@ -492,9 +498,10 @@ def is_of_circularity(aim: object) -> bool:
 class Account(CheckedRecord):
     """What is counted beside mass, such as money, emissions or energy, under an ``id`` of its own.
 
-    Over an episode it comes to Σ_t d_t·h·(Σ_k a_k(t)·f̄_k + Σ_i b_i(t)·(x_i(t) + x_i(t + 1))/2), f̄ being mean flows, a
-    the ``accounts`` of arcs and of the nodes that they enter, b the ``holding`` of nodes, and d_t = (1 + r)^(−τ) the
-    discount of what is booked in the middle of an interval, τ years after the start.
+    Over an episode it comes to Σ_t d_t·h·(Σ_k a_k·f̄_k + Σ_i b_i·(x_i(t) + x_i(t + 1))/2 + Σ_c e_c·|u_c − n_c|), f̄ being
+    mean flows, a the ``accounts`` of arcs and of the nodes that they enter, b the ``holding`` of nodes, e the
+    ``effort`` of what controls u are away from their neutral values n, and d_t = (1 + r)^(−τ) the discount of what is
+    booked in the middle of an interval, τ years after the start.
     """
 
     id: str

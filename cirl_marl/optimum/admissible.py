@@ -100,18 +100,18 @@ class Admissible:
         setting, valve = np.ones((3, steps, len(network.arcs))), np.ones((3, steps, len(network.nodes)))
         for i, node in enumerate(network.nodes):
             if node.control is not None and node.control.kind is ControlKind.RATE:
-                valve[:, :, i] = _control_range(network, node, agents)
+                valve[:, :, i] = control_range(network, node, agents)
         if isinstance(network, StagedNetwork):
             for store, id_ in network.valves.items():
                 if network.compartments[id_].control is not None:
-                    stretch = _control_range(network, network.compartments[id_], agents)
+                    stretch = control_range(network, network.compartments[id_], agents)
                     valve[:, :, network.node_index[store]] = 1.0 / stretch[::-1]
         # what leaves at the end of a life may be nothing
         setting[0][:, lifetimes.exit_arcs], setting[2][:, lifetimes.exit_arcs] = 0.0, lifetimes.most_factor
         for k, arc in enumerate(network.arcs):
-            compartment = _setter(network, arc)
+            compartment = setter(network, arc)
             if compartment is not None:
-                setting[:, :, k] = _control_range(network, compartment, agents)
+                setting[:, :, k] = control_range(network, compartment, agents)
         has_capacity = np.array([bool(arc.capacity_node) for arc in network.arcs], dtype=bool)
         setting[0][:, has_capacity] = 0.0  # as long as nothing is built they carry nothing
         with_capacity = [arc for arc in network.arcs if arc.capacity_node and network.original(arc.id) == arc.id]
@@ -307,7 +307,7 @@ def _sets_transfer(arc: Arc) -> bool:
     return arc.control is not None and arc.control.kind is ControlKind.TRANSFER
 
 
-def _control_range(network: Network, compartment: Compartment, agents: Sequence[str]) -> Floats:
+def control_range(network: Network, compartment: Compartment, agents: Sequence[str]) -> Floats:
     """Return the lowest, neutral and highest value of a control, shape (3, steps)."""
     bounds = network.control_bounds[:, network.control_rows[compartment.id].start]
     # what is supplied while nobody acts depends on the state: all that may be is allowed
@@ -315,7 +315,7 @@ def _control_range(network: Network, compartment: Compartment, agents: Sequence[
     return bounds if network.original(compartment.id) in agents or supplies else bounds[[1, 1, 1]]
 
 
-def _setter(network: Network, arc: Arc) -> Arc | Node | None:
+def setter(network: Network, arc: Arc) -> Arc | Node | None:
     """Return the compartment whose control is the arc's own factor; the valve of its donor is none."""
     donor = network.nodes[network.node_index[arc.donor]]
     if arc.law is Law.CONTROLLED and donor.control is not None and donor.control.kind is ControlKind.FLOW:

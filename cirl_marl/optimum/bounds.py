@@ -13,6 +13,7 @@ from scipy import sparse
 
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.dynamics.ledger import Ledger
+from cirl_marl.environments.actuators import planned_deviation
 from cirl_marl.errors import CirlError, whole_number
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import frozen_record, positional_record
@@ -387,7 +388,13 @@ def _solve_bound(
     circularity = plan @ circularity_weights(layout)
     levels = plan[:, layout.level : layout.imbalance]
     lifetimes = admissible.lifetimes
-    totals, beside = account_rows(lifetimes, layout, start, Ledger(lifetimes.network).rates())
+    by_flow, by_stock, by_control = Ledger(lifetimes.network).rates()
+    totals, beside = account_rows(lifetimes, layout, start, (by_flow, by_stock, 0.0 * by_control))
+    actions = normalised_actions(admissible, layout, plan, start)
+    accounts = totals @ solution.plan + beside
+    if layout.charged_controls:  # variables of efforts are only at least as large as the program asks for
+        distances = np.abs(planned_deviation(lifetimes.network, admissible.agents, actions))
+        accounts = accounts + (by_control * distances.T).sum(axis=(1, 2))
     stocks = np.concatenate([(lifetimes.start_planned @ start)[None], plan[:, layout.last]])
     return Bound(
         network=lifetimes.network,
@@ -400,12 +407,12 @@ def _solve_bound(
         service_weight=service_weight,
         min_service=min_service,
         aims=aims,
-        accounts=totals @ solution.plan + beside,
+        accounts=accounts,
         degree=layout.degree,
         circularity=circularity,
         stock=stocks @ lifetimes.totals.T,
         flow=layout.means(plan)[1] @ lifetimes.arc_sums.T,
-        actions=normalised_actions(admissible, layout, plan, start),
+        actions=actions,
         problem=problem,
         solution=solution.plan,
         certificate=solution.certificate,

@@ -18,7 +18,7 @@ from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.dynamics.ledger import Ledger
 from cirl_marl.dynamics.supply import Supply
-from cirl_marl.environments.actuators import Actuators
+from cirl_marl.environments.actuators import Actuators, planned_deviation
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.aims import Aims, RateTables
@@ -28,6 +28,8 @@ from cirl_marl.optimum.window_simulator import WindowSimulator
 
 DIFFERENCE = 1e-6
 """Step of the difference quotients, relative to the scale of a stock or to half the range of a control."""
+TINY = 1e-12
+"""Least half of a range that measures the distance of a control."""
 MOST_SLOPES = 50_000_000
 """Entries of the largest Jacobians of all intervals that are written, 0.4 GB."""
 
@@ -74,12 +76,13 @@ def jacobians(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats, Floats]
 
 @positional_record
 class StepProgram:
-    """The program of the best step: δa, levels, imbalance of each interval; then what services lack, and excesses."""
+    """The program of the best step: δa, levels, imbalance and changes of efforts of each interval, lacks, excesses."""
 
     problem: Annotated[LinearProgram, "the program"]
     scale: Annotated[Floats, "measure of each variable, shape (variables,)"]
     origin: Annotated[Floats, "its variables if nothing changes, likewise"]
     action: Annotated[Integers, "columns of δa, shape (steps, entries)"]
+    effort: Annotated[Integers, "columns of what charged distances of controls change by, shape (steps, controls)"]
     level: Annotated[Integers, "columns of the levels, shape (steps, services)"]
     lack: Annotated[Integers, "columns of what services lack and budgets are exceeded by, (services + budgets,)"]
     measured: Annotated[Integers, "interval, and row of ``measure``, of each of the first rows of G, shape (rows, 2)"]
@@ -98,13 +101,46 @@ class StepProgram:
         step, row = self.measured.T
         before, after = (np.concatenate([each.stock, each.flow], axis=1) @ self.measure.T for each in (run, trial))
         moves = np.zeros(len(values))
-        moves[self.action] = values[self.action]
+        moves[self.action], moves[self.effort] = values[self.action], values[self.effort]
         limits = self.problem.under_to.copy()
         correction = (after - before)[step, row] + self.problem.under[: len(row)] @ moves
         limits[: len(row)] += np.where(np.isin(row, self.contents), 0.0, correction)
         first = len(limits) - len(self.aims.budgets)
         limits[first:] -= self.aims.totals(trial) - self.aims.totals(run) - self.problem.under[first:] @ moves
         return replace(self, problem=replace(self.problem, under_to=limits))
+
+
+@positional_record
+class _Efforts:
+    """Controls of which something is charged for the distance from their neutral values, d + half·δa."""
+
+    entries: Annotated[Integers, "of stacked actions, shape (controls,)"]
+    controls: Annotated[Integers, "these among all controls, likewise"]
+    away: Annotated[Floats, "d, shape (steps, controls)"]
+    half: Annotated[Floats, "half the range of each, likewise"]
+
+    @classmethod
+    def of(cls, bound: Bound, rates: Floats) -> _Efforts:
+        """Take those that act in a bound; ``rates`` are per distance, shape (accounts, steps, controls)."""
+        network, actions = bound.network, bound.actions
+        acting = Actuators(network, bound.agents or None, len(actions)).control_rows
+        is_charged = np.append(rates.any(axis=(0, 1)), False)  # there are no columns if nothing is charged
+        entries = np.flatnonzero(is_charged[np.minimum(acting, len(is_charged) - 1)])
+        controls = acting[entries]
+        low, _, high = network.control_bounds[:, controls]
+        away = planned_deviation(network, bound.agents, actions)[controls].T
+        return cls(entries, controls, away, (high - low).T / 2)
+
+    def rows(self, sign: float, action: Integers, effort: Integers, count: int) -> sparse.csr_array:
+        """Return ±half·δa − δe, of columns δa and δe of ``count``, which is at most ``limits``."""
+        places, ends = np.arange(effort.size), np.ones(effort.size)
+        values = np.concatenate([sign * self.half.ravel(), -ends])
+        columns = np.concatenate([action.ravel(), effort.ravel()])
+        return sparse.csr_array((values, (np.tile(places, 2), columns)), (effort.size, count))
+
+    def limits(self, sign: float) -> Floats:
+        """Return |d| ∓ d."""
+        return np.asarray(np.abs(self.away) - sign * self.away).ravel()
 
 
 def step_program(
@@ -141,19 +177,24 @@ def step_program(
     network, limits = bound.network, bound.aims.limits if limits is None else limits
     steps, entries = bound.actions.shape
     state, services, is_absolute = slopes[2], len(network.services), network.objective.net_zero == "abs"
-    size = entries + services + 1
-    level, imbalance, count = entries, size - 1, size * steps + services + len(limits)
+    rates, rates_of_budgets = Ledger(network).rates(), bound.aims.rates(network)
+    efforts = _Efforts.of(bound, rates[2])
+    size = entries + services + 1 + len(efforts.entries)
+    level, imbalance, count = entries, entries + services, size * steps + services + len(limits)
     step_low, step_high = np.maximum(-trust, -1 - bound.actions), np.minimum(trust, 1 - bound.actions)
     furthest = np.maximum(-step_low, step_high)
     low = np.array([network.interval_means(service.low) for service in network.services]).reshape(services, steps)
     low *= 1.0 + margin
     measure, by_stage, imbalances = _measures(bound, dynamics)
     contents = _contents(bound, dynamics)
-    accounts = _account_shares(Ledger(network).rates(), dynamics)
+    accounts = _account_shares(rates, dynamics)
     weights = -bound.aims.objective(-_circularity_cost(bound, dynamics), accounts)
     cost, spent = np.zeros(count), np.zeros((len(limits), count))
-    budgets = _account_shares(bound.aims.rates(network), dynamics)
+    budgets = _account_shares(rates_of_budgets, dynamics)
     columns = size * np.arange(steps)[:, None] + np.arange(size)
+    effort = columns[:, imbalance + 1 :]
+    cost[effort] = -bound.aims.objective(np.zeros(effort.shape), rates[2][:, :, efforts.controls])
+    spent[:, effort] = rates_of_budgets[2][:, :, efforts.controls]
     rows: list[sparse.csr_array] = []
     rights: list[Floats] = []
     measured: list[Integers] = []
@@ -183,6 +224,9 @@ def step_program(
         rows.append(sparse.csr_array((block.data, places, block.indptr), (len(near), count)))
         rights.append(limit[near])
         measured.append(np.stack([np.full_like(near, t), near], axis=1))
+    for sign in (1.0, -1.0):
+        rows.append(efforts.rows(sign, columns[:, efforts.entries], effort, count))
+        rights.append(efforts.limits(sign))
     # mean level + lack ≥ demanded level
     means = sparse.kron(np.full((1, steps), -1.0 / steps), sparse.eye_array(services, size, k=level))
     lacks = sparse.hstack([means, -sparse.eye_array(services), sparse.csr_array((services, len(limits)))], format="csr")
@@ -193,6 +237,7 @@ def step_program(
     bounds = np.tile(np.array([0.0, np.inf]), (steps, size, 1))
     bounds[:, :entries] = np.stack([step_low, step_high], axis=2)
     bounds[:, level:imbalance, 1] = 1.0
+    bounds[:, imbalance + 1 :] = np.stack([-np.abs(efforts.away), efforts.half * furthest[:, efforts.entries]], axis=2)
     lower, upper = np.concatenate([bounds.reshape(-1, 2), np.tile([0.0, np.inf], (services + len(limits), 1))]).T
     if bound.service_weight is not None:
         cost /= network.objective.circularity_scale
@@ -212,16 +257,17 @@ def step_program(
     )
     net_flow = np.abs(run.flow @ imbalances)[:, None]
     largest = max(float(net_flow.max()), network.objective.circularity_scale)
-    origin = np.concatenate([np.zeros((steps, entries)), run.levels[0].T, net_flow], axis=1)
+    unchanged = np.zeros(effort.shape)
+    origin = np.concatenate([np.zeros((steps, entries)), run.levels[0].T, net_flow, unchanged], axis=1)
+    scales = [np.tile(np.append(np.ones(entries + services), largest), (steps, 1)), np.maximum(efforts.half, TINY)]
     size_of_excess = np.maximum(np.abs(bound.aims.totals(run)), np.abs(limits))
     short = [np.maximum(demand - run.levels[0].mean(axis=1), 0.0), np.maximum(bound.aims.totals(run) - limits, 0.0)]
     return StepProgram(
         problem,
-        np.concatenate(
-            [np.tile(np.append(np.ones(entries + services), largest), steps), np.ones(services), size_of_excess]
-        ),
+        np.concatenate([np.concatenate(scales, axis=1).ravel(), np.ones(services), size_of_excess]),
         np.concatenate([origin.ravel(), *short]),
         columns[:, :entries],
+        effort,
         columns[:, level:imbalance],
         np.arange(size * steps, count),
         np.concatenate(measured),
@@ -305,7 +351,7 @@ def _circularity_cost(bound: Bound, dynamics: Dynamics) -> Floats:
 
 def _account_shares(rates: RateTables, dynamics: Dynamics) -> Floats:
     """Return the share of (x', f̄) of each interval in what is booked at some rates, (rates, steps, stocks + arcs)."""
-    by_flow, by_stock = rates
+    by_flow, by_stock, _ = rates
     by_stock[:, :-1] += by_stock[:, 1:]  # a stock ends one interval and begins the next
     stages = np.zeros((by_stock.shape[2], dynamics.rows.nodes.stop))
     for store in range(len(stages)):

@@ -51,7 +51,7 @@ class Layout:
     For each piece X_i, F_i and Z_i for i = 0 … d, then the stocks at its end; after the last piece, the levels, the
     imbalance and the free valves. Of a node that stores nothing X_i is its throughput, and there is no stock at the
     end. Z_i = v·X_i is what the valve of a node lets through to several outflows. Moments are counted through all
-    pieces.
+    pieces. What controls are away from their neutral values comes last, if something is charged for it.
 
     Attributes:
         network: whose variables they are.
@@ -78,6 +78,8 @@ class Layout:
         level: first of the service levels.
         imbalance: the variable that is at least |Δ·σ_env·f̄|; counted only with ``net_zero = "abs"``.
         free_valve: first of the valves v themselves.
+        charged_controls: agents that pay for the effort of their controls.
+        effort: first of what these are away from their neutral values.
         size: variables of an interval.
     """
 
@@ -91,9 +93,11 @@ class Layout:
         *,
         coarse: bool,
         has_end_flows: bool = False,
+        charged_controls: tuple[str, ...] = (),
     ) -> None:
         """Lay the variables out; the arguments are the attributes of the same names."""
         self.network, self.pieces, self.degree = network, pieces, degree
+        self.charged_controls = charged_controls
         self.valves, self.free_valves = valves, free_valves
         self.coarse, self.has_end_flows = coarse, has_end_flows
         self.moments = range(pieces * (degree + 1))
@@ -119,7 +123,8 @@ class Layout:
         self.level = self.steady + len(steady_nodes) + len(steady_arcs)
         self.imbalance = self.level + len(self.network.services)
         self.free_valve = self.imbalance + 1
-        self.size = self.free_valve + len(self.free_valves)
+        self.effort = self.free_valve + len(self.free_valves)
+        self.size = self.effort + len(self.charged_controls)
 
     def with_constant_parts(self, nodes: Integers, arcs: Integers) -> Layout:
         """Return the layout in which constant parts of some throughputs and flows are variables too."""

@@ -33,6 +33,7 @@ from cirl_marl.optimum.constraints import (
     valve_envelopes,
 )
 from cirl_marl.optimum.content_ranges import check_contents
+from cirl_marl.optimum.effort import charged_controls, effort_rows, largest_distances
 from cirl_marl.optimum.matrices import BEFORE, NOW, ChainedRows, IntervalCache, Layout, ProgramRows, RowParts
 from cirl_marl.optimum.mixtures import content_rows, mixture_rows
 from cirl_marl.optimum.quasi_steady import decay_rows, end_laws, has_fast_stocks, quasi_steady_rows
@@ -226,6 +227,7 @@ class Programs:
         if mixtures is not None:
             mixture_rows(admissible, reach, intervals, rows)
             content_rows(admissible, high.reshape(steps, -1), intervals, rows)
+        effort_rows(admissible, reach, intervals, rows)
         from_start = rows.matrices()[0]
         from_start.eliminate_zeros()
         lifetime_rows, lifetime_limits = lifetimes.rows(layout, initial, intervals)
@@ -291,7 +293,8 @@ def _layout(
     movable = (admissible.valve[0] < admissible.valve[1]).any(axis=0)
     valves = np.flatnonzero(movable & ((exits > 1) | (exits > 0) & (schedules > 0)))
     free_valves = np.flatnonzero(movable & (exits > 0) & (schedules > 0))
-    fine = Layout(network, pieces, degree, valves, free_valves, coarse=pieces < substeps)
+    make = partial(Layout, network, charged_controls=charged_controls(admissible))
+    fine = make(pieces, degree, valves, free_valves, coarse=pieces < substeps)
     variables, entries = fine.size * network.episode.horizon, admissible.lifetimes.entries(fine)
     fewer, large = 0.0 if merge_pieces else float(pieces), LARGE if large is None else large
     if merge_pieces is None and variables > large:
@@ -302,7 +305,7 @@ def _layout(
     if pieces <= fewer_pieces:
         return fine
     has_end_flows = bool(merge_pieces) or has_fast_stocks(admissible, network.episode.control_interval / fewer_pieces)
-    return Layout(network, fewer_pieces, degree, valves, free_valves, coarse=True, has_end_flows=has_end_flows)
+    return make(fewer_pieces, degree, valves, free_valves, coarse=True, has_end_flows=has_end_flows)
 
 
 def _box(
@@ -331,7 +334,9 @@ def _box(
     high[:, layout.level : layout.imbalance] = 1.0
     weights = network.objective.reference_interval * np.abs(network.sustainability * network.environmental)
     high[:, layout.imbalance] = most @ weights
-    low[:, layout.free_valve :], high[:, layout.free_valve :] = valve[:, :, layout.free_valves]
+    free_valves = slice(layout.free_valve, layout.effort)
+    low[:, free_valves], high[:, free_valves] = valve[:, :, layout.free_valves]
+    high[:, layout.effort :] = largest_distances(admissible, layout.charged_controls)[period]
     return low.ravel(), high.ravel()
 
 

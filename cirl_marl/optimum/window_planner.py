@@ -31,6 +31,7 @@ import numpy as np
 from scipy import sparse
 
 from cirl_marl.dynamics.ledger import Ledger
+from cirl_marl.environments.actuators import planned_deviation
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
@@ -180,8 +181,10 @@ class Future:
     def _rates(self, intervals: range, accounts: slice | list[int], counts: Floats) -> RateTables:
         """Return the rates of some accounts, times what amounts of each interval of the episode count."""
         places, count = self._places(intervals), counts[:, intervals.start : intervals.stop, None]
-        by_flow, by_stock = (rates[accounts, places.start : places.stop] * count for rates in self._rate_tables)
-        return by_flow, by_stock
+        by_flow, by_stock, by_control = (
+            rates[accounts, places.start : places.stop] * count for rates in self._rate_tables
+        )
+        return by_flow, by_stock, by_control
 
     def booking_rows(self, problem: Program, task: WindowTask) -> tuple[Any, Floats]:
         """Return rows of what is booked of budgets over the variables of a program, and what they have beside.
@@ -239,8 +242,11 @@ class Future:
         bookings, accounts = np.zeros((len(intervals), len(self._budgets))), np.zeros((0, len(intervals)))
         if self._ledger is not None:  # whose copies are the intervals here
             stores = self._simulator.dynamics.rows.stocks(np.append(stocks, np.ones((len(stocks), 1)), axis=1).T)
+            deviation, agents = None, self.admissible.agents
+            if self._ledger.has_efforts:
+                deviation = planned_deviation(self.network, agents, actions, intervals.start)
             entries = self._ledger.entries(
-                np.ascontiguousarray(flows.T), stores[:, :-1], stores[:, 1:], np.array(intervals)
+                np.ascontiguousarray(flows.T), stores[:, :-1], stores[:, 1:], deviation, np.array(intervals)
             )
             amounts, period = self._ledger.sums(entries), slice(task.intervals.start, task.intervals.stop)
             accounts = amounts * self._discount[:, period]
@@ -317,6 +323,8 @@ class WindowPlanner:
         if aims.charges:
             rates = Ledger(network).rates()
             scales = [np.array([part.scale for part in parts]) for parts in (network.arcs, network.stores)]
+            low, neutral, high = network.control_bounds
+            scales.append(np.maximum(high - neutral, neutral - low).max(axis=1)[: rates[2].shape[2]])
             accounts = sum((np.abs(rate) @ scale).sum(axis=1) for rate, scale in zip(rates, scales, strict=True))
             self._scale = size = aims.size(network, np.asarray(accounts))
         slack_count = len(aims.budgets) + len(network.services)

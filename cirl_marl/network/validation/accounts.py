@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network.declarations import bound_problems
-from cirl_marl.network.elements import CIRCULARITY, Node
+from cirl_marl.network.elements import CIRCULARITY, Arc, Node
 from cirl_marl.network.specification import Specification
 from cirl_marl.network.units import factor
 
@@ -28,12 +28,17 @@ def account_problems(network: Specification) -> Iterator[str]:
     accounts = [account.id for account in network.accounts]
     for part in (*network.nodes, *network.arcs):
         holding = part.holding if isinstance(part, Node) else ()
-        if not part.accounts and not holding:
+        if not (part.accounts or part.effort or holding):
             continue  # by far the most usual
         subject = f"{type(part).__name__.lower()} '{part.id}'"
-        for name, rates in (("accounts", part.accounts), ("holding", holding)):
+        for name, rates in (("accounts", part.accounts), ("effort", part.effort), ("holding", holding)):
             for id_ in dict(rates):
                 if id_ not in accounts:
                     yield f"{subject}: {name}: {unknown_name('account', id_, accounts)}"
         if isinstance(part, Node) and holding and not part.stores:
             yield f"{subject}: holding: it stores nothing; charge what enters it, under accounts"
+        if part.effort and part.control is None:
+            yield f"{subject}: effort: it has no control, which could be away from its neutral value"
+        if part.effort and isinstance(part, Arc) and part.makes_up_for:
+            fault = f"what it supplies to make up for '{part.makes_up_for}' is neutral, however much"
+            yield f"{subject}: effort: {fault}; charge what flows, under accounts"
