@@ -68,7 +68,7 @@ def small(
 ACCOUNTS = (Account(id="cost", unit="EUR_2023", discount=0.04), Account(id="emissions", unit="t CO2e"))
 
 
-def booked(network: Network, seed: int, *, credits: bool = True) -> Network:
+def booked(network: Network, seed: int, *, credits: bool = True, efforts: bool = True) -> Network:
     """Return a network whose compartments book random amounts, some of which change in time."""
     rng = np.random.default_rng([seed, 7])
     length = network.episode.control_interval * network.episode.horizon
@@ -84,7 +84,8 @@ def booked(network: Network, seed: int, *, credits: bool = True) -> Network:
 
     nodes = tuple(replace(n, accounts=rates(), holding=rates() if n.stores else {}) for n in network.nodes)
     arcs = tuple(replace(a, accounts=rates()) for a in network.arcs)
-    nodes, arcs = (tuple(_with_effort(part, rng) for part in parts) for parts in (nodes, arcs))
+    if efforts:
+        nodes, arcs = (tuple(_with_effort(part, rng) for part in parts) for parts in (nodes, arcs))
     return replace(network, nodes=nodes, arcs=arcs, accounts=ACCOUNTS, scenarios={})
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,13 @@ CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any], dict[str, Any]]] = {
     "demonstrations": ("PPO", PPO, {"demonstrations": {"controller": "neutral", "steps": 20}}, {}),
     "budgets": ("PPO", PPO, {}, {"at_most": {"emissions": -5.0}}),
     "budgets by exact gradients": ("PPO", PPO, {}, {"engine": "gradients", "at_most": {"emissions": -5.0}}),
+    "budgets of years": ("PPO", PPO, {}, {"at_most": {"emissions/year": -5.0, "cost": 1.0}}),
+    "budgets of years by exact gradients": (
+        "PPO",
+        PPO,
+        {},
+        {"engine": "gradients", "at_most": {"emissions/year": -5.0, "cost": 1.0}},
+    ),
     "demonstrations for a buffer": ("SAC", OFF, {"demonstrations": {"controller": "neutral", "steps": 20}}, {}),
 }
 RUN: dict[str, Any] = {"steps": 160, "envs": 2, "engine": "lockstep", "evaluations": 6, "episodes": 2}
@@ -118,7 +126,8 @@ def stop_at(monkeypatch: pytest.MonkeyPatch, steps: list[int], *, saved: bool) -
 def test_the_same_bits(case: str, saved: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Weights, normalisers, optimisers, streams, metrics, evaluations: whenever it is stopped, however often."""
     found, options = recipe(case)
-    network = booked(load_network("copper_net"), 2) if found.run.at_most else "copper_net"
+    unit = "year" if "emissions/year" in found.run.at_most else "day"
+    network = replace(booked(load_network("copper_net"), 2), time_unit=unit) if found.run.at_most else "copper_net"
     train(network, found, directory=tmp_path / "whole", seed=3, **options)
     stops = sorted(np.random.default_rng(len(case)).choice(np.arange(1, 79), 5, replace=False).tolist())
     left = list(stops)

@@ -166,7 +166,7 @@ def test_each_budget_has_its_price(tmp_path: Path, reward: str) -> None:
     scale = network.objective.circularity_scale
     multiplier = Multipliers(env, 0.95, 0.5, 0.0, {charged: -40.0, first: 10.0})
     np.testing.assert_allclose(env.account_charges, 0.1 * scale / np.array([10.0, 40.0]))
-    multiplier.update([1.0], [10.2, -39.0])
+    multiplier.update([1.0], {first: 10.2, charged: -39.0})
     shares = np.array([0.2 / 10.0, 1.0 / 40.0]) / 0.05
     expected = 0.1 * np.exp(0.5 * shares) * scale / [10.0, 40.0]
     np.testing.assert_allclose(env.account_charges, expected, rtol=1e-12)
@@ -185,11 +185,11 @@ def test_each_budget_has_its_price(tmp_path: Path, reward: str) -> None:
     again = Multipliers(other, 0.95, 0.5, 0.0, {charged: -40.0, first: 10.0})
     again.load(tmp_path)
     for moved in (multiplier, again):
-        moved.update([1.0], [9.9, -41.0])
+        moved.update([1.0], {first: 9.9, charged: -41.0})
     np.testing.assert_array_equal(other.account_charges, env.account_charges)
     assert (env.account_charges < expected).all()
     for _ in range(100):
-        multiplier.update([1.0], [0.0, -100.0])
+        multiplier.update([1.0], {first: 0.0, charged: -100.0})
     np.testing.assert_allclose(env.account_charges, 1e-4 * scale / np.array([10.0, 40.0]))
 
 
@@ -199,7 +199,7 @@ def test_budgets_come_beside_charges_and_without_services() -> None:
     env = MultiAgentVectorEnv(network, num_envs=1, reward="team", charges={"emissions": 3.0})
     multiplier = Multipliers(env, 0.9, 1.0, 0.0, {"cost": 500.0})
     before, weight = env.account_charges.copy(), env.circularity_weight
-    multiplier.update([], [600.0, 1.0])
+    multiplier.update([], {"cost": 600.0})
     assert before[0] > 0 and env.account_charges[0] == pytest.approx(before[0] * np.e)
     assert env.account_charges[1] == before[1] == 3.0 and env.circularity_weight == weight
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -26,6 +26,7 @@ from cirl_marl import (
     MultiAgentVectorEnv,
     Network,
     Series,
+    Trained,
     bound,
     load_network,
     load_recipe,
@@ -33,8 +34,10 @@ from cirl_marl import (
     write_network,
 )
 from cirl_marl.cli import app
-from cirl_marl.controllers import Random
+from cirl_marl.controllers import Neutral, Random
 from cirl_marl.controllers.rollout import Rollout, rollout
+from cirl_marl.learners.policies import Policies
+from cirl_marl.learners.validation import FIRST_SEED, Multipliers, validation_score
 from cirl_marl.network.disturbances import AutoRegression, DisturbanceEffect
 from cirl_marl.optimum import improve, improve_plan, simulate_plan, smooth_plan
 from cirl_marl.optimum.aims import aims_of, budget_texts
@@ -168,6 +171,7 @@ def test_budgets_per_year_that_cannot_be_meant_are_refused() -> None:
     for name, of, message in (
         ("emissions/month", network, "'emissions/month': a budget is of an episode, 'emissions', or 'emissions/year'"),
         ("emissions/", network, "'emissions/': a budget is of an episode"),
+        ("/year", network, "at_most: '/year' names no account; write one before it, as in 'NAME/year'"),
         ("emission/year", network, "unknown account 'emission'. Did you mean 'emissions'"),
         ("emissions/year", slow, "'emissions/year': an interval, 1 century, is longer than a year; give the total"),
     ):
@@ -178,14 +182,9 @@ def test_budgets_per_year_that_cannot_be_meant_are_refused() -> None:
     with pytest.raises(CirlError, match=r"the budget of emissions in year 1 at most .*\(at least .*emissions in year"):
         bound(network, min_service=0.95, at_most={"emissions/year": 0.5 * least})
     assert bound(network, aim="emissions", min_service=0.95, at_most={"emissions/year": 1.01 * least}).verify()
-    disturbances = {"demand": AutoRegression(deviation=0.3, persistence=0.8, low=0.5, high=1.6)}
-    effect = {f"services.{network.services[0].id}.low": DisturbanceEffect(by="demand")}
-    env = MultiAgentVectorEnv(replace(network, disturbances=disturbances, disturbed=effect), num_envs=1)
-    with pytest.raises(CirlError, match="MPC: no budget per year, as of emissions in year 1, can be kept: what is"):
-        MPC(min_service=0.9, at_most={"emissions/year": 1e9}).start(env, 0)
     given = load_recipe("exact_gradients")
-    recipe = given.model_copy(update={"run": given.run.model_copy(update={"at_most": {"emissions/year": 1e9}})})
-    with pytest.raises(CirlError, match=r"run\.at_most: no budget per year, as of emissions in year 1, can be kept"):
+    recipe = given.model_copy(update={"run": given.run.model_copy(update={"at_most": {"emission/year": 1e9}})})
+    with pytest.raises(CirlError, match=r"at_most: unknown account 'emission'. Did you mean 'emissions'"):
         train(network, recipe, steps=1000)
 
 
@@ -294,3 +293,94 @@ def test_each_account_has_a_text_of_its_own() -> None:
         ("cost at most 10000 EUR_2023 a year", ["cost in year 1", "cost in year 2"]),
         ("cost at most 30000 EUR_2023", ["cost"]),
     ]
+
+
+def test_each_year_has_its_price(tmp_path: Path) -> None:
+    """What is booked in a year is paid at the price of that year, whatever the discount; prices go on from a file."""
+    network = yearly(4).with_options(episode={"control_interval": 0.5})
+    network = replace(network, accounts=tuple(replace(each, discount=0.3) for each in ACCOUNTS))
+    budgets = {"emissions/year": 1000.0, "emissions": 3000.0, "cost": -50.0}
+    env, plain, other = (MultiAgentVectorEnv(network, num_envs=2, reward="circularity") for _ in range(3))
+    scale, multiplier = network.objective.circularity_scale, Multipliers(env, 0.9, 0.5, 0.0, budgets)
+    # half an episode each, then all of it
+    np.testing.assert_allclose(multiplier._budget_integrals, [0.05, 0.05, 0.1, 0.1])
+    amounts = {"emissions in year 1": 1050.0, "emissions in year 2": 975.0, "emissions": 3000.0, "cost": -50.0}
+    multiplier.update([1.0], amounts)
+    prices = np.array([0.05 * np.exp(0.25), 0.05 * np.exp(-0.125)]).repeat(2) * scale / 1000.0
+    discount = env.ledger.discount
+    expected = np.stack([np.full(4, 0.1 * scale / 50.0), prices / discount[1] + 0.1 * scale / 3000.0])
+    np.testing.assert_allclose(env.account_charges, expected, rtol=1e-12)
+    for each in (env, plain):
+        each.reset(seed=0)
+    plain.circularity_weight, plain.service_factors = env.circularity_weight, env.service_factors
+    for t in range(4):
+        actions = np.zeros((len(env.actuators.control_rows), 2))
+        paid, bookings = env.advance(actions).reward, plain.advance(actions)
+        less = 4 * (expected[:, t] * discount[:, t]) @ bookings.bookings
+        np.testing.assert_allclose(bookings.reward - paid, np.repeat(less[None], len(env.agents), axis=0), rtol=1e-9)
+    multiplier.save(tmp_path)
+    again = Multipliers(other, 0.9, 0.5, 0.0, budgets)
+    again.load(tmp_path)
+    for moved in (multiplier, again):
+        moved.update([1.0], amounts)
+    np.testing.assert_array_equal(other.account_charges, env.account_charges)
+    with pytest.raises(CirlError, match="it holds the price of service"):
+        Multipliers(other, 0.9, 0.5, 0.0, {"emissions": 3000.0}).load(tmp_path)
+
+
+def test_scores_tell_what_each_year_books() -> None:
+    """A checkpoint with one year too many is no better than one that keeps all; older ones have totals alone."""
+    network, policies = yearly(3), cast(Policies, Neutral())
+    aims = aims_of(network, "circularity", {"emissions/year": 10.0})
+    score = validation_score(MultiAgentVectorEnv(network, num_envs=2), policies, aims)
+    run = rollout(MultiAgentVectorEnv(network, num_envs=2), Neutral(), seed=FIRST_SEED)
+    assert [*score.accounts] == ["cost", "emissions", *(budget.name for budget in aims.budgets)]
+    np.testing.assert_allclose([*score.accounts.values()][2:], run.bookings[0, 1])
+    assert [*validation_score(MultiAgentVectorEnv(network, num_envs=2), policies).accounts] == ["cost", "emissions"]
+    most = {budget.name: amount + 1.0 for budget, amount in zip(aims.budgets, run.bookings[0, 1].tolist(), strict=True)}
+    score = replace(score, service_bound=1.0)
+    assert score.rank(0.9, most)[0] and not score.rank(0.9, most | {"emissions in year 2": 0.0})[0]
+
+
+@pytest.mark.slow
+def test_learners_keep_the_budget_of_each_year(tmp_path: Path) -> None:
+    """By exact gradients and a price for each year, near the bound that knows them."""
+    network = yearly(6)
+    least = simulate_plan(bound(network, aim="emissions", min_service=0.9))
+    most = 1.3 * float(by_year(least).max())
+    free = simulate_plan(bound(network, min_service=0.9))
+    assert by_year(free).max() > 1.1 * most
+    given = load_recipe("exact_gradients")
+    run = given.run.model_copy(update={"min_service": 0.9, "at_most": {"emissions/year": most}})
+    train(network, given.model_copy(update={"run": run}), steps=120_000, seed=2, directory=tmp_path / "run")
+    played = rollout(MultiAgentVectorEnv(network, num_envs=16), Trained(tmp_path / "run"), seed=7)
+    assert (played.bookings[:, 1].mean(axis=0) < most * 1.03).all()
+    assert played.episode_levels.mean() > 0.9 - 5e-3
+    limit = bound(network, min_service=0.9, at_most={"emissions/year": most}).objective
+    assert played.episode_circularity.mean() > limit - 0.1 * abs(limit)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("futures", [None, 2])
+def test_mpc_in_a_disturbed_network_charges_for_years(futures: int | None) -> None:
+    """At the multipliers that the plan of what is expected has for each year: less is booked, and no less delivered."""
+    network = yearly(6)
+    disturbances = {"demand": AutoRegression(deviation=0.1, persistence=0.5, low=0.7, high=1.3)}
+    effect = {f"services.{network.services[0].id}.low": DisturbanceEffect(by="demand")}
+    least = simulate_plan(bound(network, aim="emissions", min_service=0.9))
+    most = 1.3 * float(by_year(least).max())
+    network = replace(network, disturbances=disturbances, disturbed=effect)
+    runs = []
+    for budgets in (None, {"emissions/year": most}):
+        control = MPC(futures=futures, min_service=0.9, at_most=budgets)
+        runs.append(rollout(MultiAgentVectorEnv(network, num_envs=8), control))
+    outlook = control._common_outlook
+    assert outlook is not None and outlook.charges.shape == (6,) and (outlook.charges > 0).all()
+    free, kept = (run.bookings[:, 1].mean(axis=0) for run in runs)
+    assert kept.sum() < 0.7 * free.sum() and (kept[:3] < 0.5 * free[:3]).all()
+    assert runs[1].episode_levels.mean() >= runs[0].episode_levels.mean()
+    future = control._planner.futures[0]
+    task = replace(outlook.task, charges=np.eye(6)[1], is_outlook=False)
+    difference = future.program(task, None).cost - future.program(replace(task, charges=np.zeros(0)), None).cost
+    years = np.flatnonzero(difference.reshape(6, -1).any(axis=1))
+    assert years.tolist() == [1]

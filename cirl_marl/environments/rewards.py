@@ -233,7 +233,7 @@ class Credit:
     a, discounted), with the ``charges`` c and T intervals: so that their mean is λ̄ − Σ_a c_a·(total of a).
 
     Attributes:
-        charges: c, shape (accounts,), mass per unit of the account.
+        charges: c, mass per unit of the account, shape (accounts,), or (accounts, horizon) if they change in time.
     """
 
     def __init__(
@@ -296,7 +296,8 @@ class Credit:
         if self.mode in ("difference", "mixed_difference"):
             credit = credit - self._counterfactuals(state, controls)
         if self.charges.any():
-            credit = credit - self._dynamics.network.episode.horizon * (self.charges[:, None] * amounts).sum(axis=0)
+            charges = self.charges[:, None] if self.charges.ndim == 1 else self.charges.take(state.step, axis=1)
+            credit = credit - self._dynamics.network.episode.horizon * (charges * amounts).sum(axis=0)
         if self.mode in ("mixed", "mixed_difference"):
             reward: Floats = local * self._rest
             reward += credit * self._per_mass

@@ -194,13 +194,17 @@ class MultiAgentVectorEnv:
 
     @property
     def account_charges(self) -> Floats:
-        """What a unit of each account costs in rewards with λ, shape (accounts,), mass; others count from now on."""
+        """What a unit of each account costs in rewards with λ, mass; others count from now on.
+
+        The shape is (accounts,), or (accounts, horizon) if it changes in time.
+        """
         return self._credit.charges
 
     @account_charges.setter
     def account_charges(self, charges: ArrayLike) -> None:
         values = np.array(charges, dtype=np.float64)
-        if values.shape != self._credit.charges.shape or not np.isfinite(values).all():
+        shapes = (len(self.ledger.accounts),), self.ledger.discount.shape
+        if values.shape not in shapes or not np.isfinite(values).all():
             raise CirlError(f"charges must be finite numbers, one for each account, got {charges!r}")
         self._credit.charges = values
 

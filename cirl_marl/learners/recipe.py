@@ -202,7 +202,9 @@ class Run(Settings):
         "has the highest mean circularity. Left out: the best is paid most",
     )
     at_most: dict[StrictStr, Number] = Field(
-        {}, description="budgets beside min_service: highest mean totals of accounts, in their units"
+        {},
+        description="budgets beside min_service: highest mean totals of accounts, in their units, or with ``/year`` "
+        "highest mean amounts of each year, not discounted",
     )
     price_rate: Annotated[Number, Field(ge=0)] = Field(
         0.0,

@@ -112,8 +112,7 @@ class Training:
         elif checkpoint.name.endswith("-start"):
             for learner, _ in starts:
                 begin_again(checkpoint, learner)
-        budgets = aims_of(env.network, CIRCULARITY, config.recipe.run.at_most)
-        budgets.refuse_years("run.at_most", "prices move with totals of episodes; bound one, or charge for it")
+        self._aims = aims_of(env.network, CIRCULARITY, config.recipe.run.at_most)
         self._multiplier = self._constraint_multipliers()  # its least price is the recipe's, not one that has moved
         if self._saved_state is not None:
             self.world.load_state_dict(self._saved_state["world"])
@@ -315,8 +314,9 @@ class Training:
         if self._validation_env is None:
             return
         self._bring_up_to_date()
-        score = validation_score(self._validation_env, StackedPolicies(self.learners, self._stacks))
-        target = self.config.recipe.run.min_service, self.config.recipe.run.at_most
+        policies = StackedPolicies(self.learners, self._stacks)
+        score = validation_score(self._validation_env, policies, self._aims)
+        target = self.config.recipe.run.min_service, {budget.name: budget.most for budget in self._aims.budgets}
         self._last_evaluation = self.joint_steps
         better = self._best is None or score.rank(*target) > self._best.rank(*target)
         if better:
@@ -328,7 +328,7 @@ class Training:
             row = (score.circularity, score.service, score.service_bound, score.episode_return)
             self._evaluations.append([*steps, *row, self.env.circularity_weight, better])
         if self._multiplier is not None:
-            self._multiplier.update([*score.levels.values()], [*score.accounts.values()])
+            self._multiplier.update([*score.levels.values()], score.accounts)
 
     def _write_policies(self, folder: Path) -> None:
         for learner in self.learners.values():

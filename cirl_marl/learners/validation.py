@@ -23,6 +23,8 @@ from cirl_marl.errors import CirlError, RunError
 from cirl_marl.learners.policies import Policies
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record
+from cirl_marl.network.elements import CIRCULARITY
+from cirl_marl.optimum.aims import NO_AIMS, Aims, aims_of
 from cirl_marl.records.files import read_record, write_json
 
 FIRST_SEED = 2**40
@@ -47,15 +49,15 @@ class Score:
     service_bound: Annotated[float, "lower confidence bound of that level, one-sided at 95 %"]
     episode_return: Annotated[float, "mean return of an episode, summed over the agents"]
     levels: Annotated[Mapping[str, float], "such a bound for each service, by id"] = field(default_factory=dict)
-    accounts: Annotated[Mapping[str, float], "upper confidence bound of the total of each account, by id"] = field(
-        default_factory=dict
-    )
+    accounts: Annotated[
+        Mapping[str, float], "upper confidence bound of the total of each account, by id, and of each budget, by name"
+    ] = field(default_factory=dict)
 
     def rank(self, min_service: float | None, at_most: Mapping[str, float] = MappingProxyType({})) -> Rank:
         """Return the key by which scores are compared, the higher the better.
 
         If a level of service is demanded: whether its bound reaches that level, and all budgets are kept, then λ̄ if so
-        and what lacks most if not, of a budget in parts of it. Otherwise: the return.
+        and what lacks most if not, of a budget in parts of it. Otherwise: the return. Budgets come by name.
         """
         if min_service is None:
             return True, self.episode_return
@@ -75,11 +77,15 @@ class Score:
         return cls(**{names.get(key, key): value for key, value in figures.items()})
 
 
-def validation_score(env: MultiAgentVectorEnv, policies: Policies) -> Score:
-    """Play the episodes that choose, the same ones each time; ``env`` has a copy for each and is nobody else's."""
+def validation_score(env: MultiAgentVectorEnv, policies: Policies, aims: Aims = NO_AIMS) -> Score:
+    """Play the episodes that choose, the same ones each time; ``env`` has a copy for each and is nobody else's.
+
+    Of the ``aims`` budgets count.
+    """
     run = rollout(env, policies, seed=FIRST_SEED)
     levels = run.episode_levels
     lower_bounds, upper_bounds = _confidence_bound(levels, -1.0), _confidence_bound(run.accounts, 1.0)
+    budgets = zip(aims.budgets, _confidence_bound(aims.bookings(run), 1.0).tolist(), strict=True)
     ids = [service.id for service in env.network.services]
     return Score(
         circularity=float(run.episode_circularity.mean()),
@@ -87,7 +93,8 @@ def validation_score(env: MultiAgentVectorEnv, policies: Policies) -> Score:
         service_bound=float(lower_bounds.min(initial=1.0)),
         episode_return=float(run.returns.sum(axis=0).mean()),
         levels=dict(zip(ids, lower_bounds.tolist(), strict=True)),
-        accounts=dict(zip(env.ledger.accounts, upper_bounds.tolist(), strict=True)),
+        accounts=dict(zip(env.ledger.accounts, upper_bounds.tolist(), strict=True))
+        | {budget.name: amount for budget, amount in budgets},
     )
 
 
@@ -123,24 +130,37 @@ LEAST_BUDGET_PRICE, FIRST_BUDGET_PRICE = 1e-4, 0.1
 """Price below which that of a budget does not fall, and with which it begins, per circularity scale and its parts."""
 
 
-def budget_levels(budgets: Mapping[int, float], accounts: Floats, min_service: float) -> Floats:
-    """Return totals of accounts as levels of services: min_service where they are just the budget.
+def first_prices(aims: Aims, horizon: int) -> Floats:
+    """Return the prices with which budgets begin, those of a year with its part of an episode, shape (budgets,)."""
+    lengths = [horizon if budget.year is None else budget.year.stop - budget.year.start for budget in aims.budgets]
+    return FIRST_BUDGET_PRICE * np.array(lengths, dtype=np.float64) / horizon
+
+
+def budget_levels(aims: Aims, amounts: Floats, min_service: float) -> Floats:
+    """Return what is booked of budgets as levels of services: min_service where it is just the budget.
 
     Args:
-        budgets: by position of the account.
-        accounts: totals, shape (accounts, ...).
+        aims: that have the budgets.
+        amounts: booked of each, shape (episodes, budgets).
         min_service: level that is demanded of services.
+
+    Returns:
+        Shape (budgets, episodes).
     """
-    excess = [(accounts[account] - most) / (abs(most) or 1.0) for account, most in budgets.items()]
-    return np.asarray(min_service - np.array(excess), dtype=np.float64)
+    excess = (amounts - aims.limits) / aims.sizes
+    return np.asarray(min_service - excess.T, dtype=np.float64)
 
 
-def charges_of(env: MultiAgentVectorEnv, budgets: Mapping[int, float], prices: Floats) -> Floats:
-    """Return what a unit of each account costs at the ``prices`` of budgets, shape (accounts,), mass."""
-    charges = np.zeros(len(env.ledger.accounts))
-    for (account, most), price in zip(budgets.items(), prices.tolist(), strict=True):
-        charges[account] = price * env.network.objective.circularity_scale / (abs(most) or 1.0)
-    return charges
+def charges_of(env: MultiAgentVectorEnv, aims: Aims, prices: Floats) -> Floats:
+    """Return what a unit of each account, discounted, costs at the ``prices`` of budgets, mass.
+
+    The shape is (accounts, 1), with budgets of years (accounts, horizon).
+    """
+    ledger, scale = env.ledger, env.network.objective.circularity_scale
+    charges = np.zeros(ledger.discount.shape)
+    for budget, price, size, count in zip(aims.budgets, prices, aims.sizes, aims.counts(ledger), strict=True):
+        charges[budget.account] += price * scale / size * (count / ledger.discount[budget.account])
+    return charges if aims.has_years else charges[:, :1]
 
 
 class Multipliers:
@@ -155,7 +175,8 @@ class Multipliers:
     only the damping, which is at once, stops them.
 
     A budget B of an account has a multiplier p_b as well, per circularity scale c and part of the budget, so that a
-    unit of the account is charged for with p_b·c/|B|; its shortfall is (total − B)/|B|, against the same room.
+    unit of the account is charged for with p_b·c/|B|; its shortfall is (total − B)/|B|, against the same room. A budget
+    per year is one for each year, with a multiplier that charges for what is booked in it.
     """
 
     def __init__(
@@ -166,20 +187,20 @@ class Multipliers:
         damping_gain: float,
         at_most: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
-        """Begin with the weight that ``env`` has; ``at_most`` are the budgets of accounts, by id."""
+        """Begin with the weight that ``env`` has; ``at_most`` are the budgets of accounts, as ``bound`` takes them."""
         self._env, self._min_service, self._rate, self._damping_gain = env, min_service, rate, damping_gain
-        self._budgets = {env.ledger.accounts.index(account): most for account, most in at_most.items()}
-        self._budget_integrals: Floats = np.full(len(self._budgets), FIRST_BUDGET_PRICE)
+        self._aims = aims_of(env.network, CIRCULARITY, at_most)
+        self._budget_integrals: Floats = first_prices(self._aims, env.network.episode.horizon)
         self._base_charges: Floats = np.array(env.account_charges)
         self._charge(self._budget_integrals)
         weight = max(env.circularity_weight, 1.0 / (1.0 + LARGEST_MULTIPLIER))
         self._least = (1.0 - weight) / weight
         self._integrals: Floats = np.full(len(env.network.services), self._least)
 
-    def update(self, levels: ArrayLike, accounts: ArrayLike = ()) -> None:
+    def update(self, levels: ArrayLike, accounts: Mapping[str, float] = MappingProxyType({})) -> None:
         """Move the multipliers after a validation.
 
-        It assures ``levels``, shape (services,), and totals of at most ``accounts``, shape (accounts,).
+        It assures ``levels``, shape (services,), and at most so much on ``accounts``, as ``Score`` has them.
         """
         self._integrals, prices = price_step(
             self._integrals, levels, self._min_service, self._rate, self._damping_gain, least=self._least
@@ -188,16 +209,18 @@ class Multipliers:
             highest = float(prices.max())
             self._env.circularity_weight = 1.0 / (1.0 + highest)
             self._env.service_factors = prices / highest if highest else np.ones_like(prices)
-        if self._budgets:
-            levels_of_budgets = budget_levels(self._budgets, np.asarray(accounts, dtype=np.float64), self._min_service)
+        if self._aims.budgets:
+            amounts = np.array([[accounts[budget.name] for budget in self._aims.budgets]], dtype=np.float64)
+            levels_of_budgets = budget_levels(self._aims, amounts, self._min_service)[:, 0]
             options = (self._min_service, self._rate, self._damping_gain, LEAST_BUDGET_PRICE)
             self._budget_integrals, budget_prices = price_step(self._budget_integrals, levels_of_budgets, *options)
             self._charge(budget_prices)
 
     def _charge(self, budget_prices: Floats) -> None:
         """Charge for accounts at the prices of budgets, beside what the environment charges for anyhow."""
-        if self._budgets:
-            self._env.account_charges = self._base_charges + charges_of(self._env, self._budgets, budget_prices)
+        if self._aims.budgets:
+            charges = self._base_charges[:, None] + charges_of(self._env, self._aims, budget_prices)
+            self._env.account_charges = charges if self._aims.has_years else charges[:, 0]
 
     def save(self, folder: Path) -> None:
         """Write the weight, the factors and the integral parts to a checkpoint."""
@@ -206,7 +229,7 @@ class Multipliers:
             "service_factors": self._env.service_factors.tolist(),
             "lasting_price": self._integrals.tolist(),
         }
-        if self._budgets:
+        if self._aims.budgets:
             state["account_charges"] = self._env.account_charges.tolist()
             state["lasting_budget_price"] = self._budget_integrals.tolist()
         write_json(folder / "price.json", state)
@@ -223,14 +246,14 @@ class Multipliers:
             if np.max(factors, initial=0.0) > 1.0:
                 raise ValueError(f"factors of {factors}, of which the dearest is 1")
             self._env.service_factors = factors
-            if self._budgets:
+            if budgets := len(self._aims.budgets):
                 charges = np.array(state["account_charges"], dtype=np.float64)
-                highest = charges_of(self._env, self._budgets, np.full(len(self._budgets), LARGEST_MULTIPLIER))
-                if (np.abs(charges - self._base_charges) > highest * (1 + 1e-9)).any():
+                highest = charges_of(self._env, self._aims, np.full(budgets, LARGEST_MULTIPLIER))
+                if (np.abs(charges.T - self._base_charges) > highest.T * (1 + 1e-9)).any():
                     raise ValueError(f"charges of {charges.tolist()}, of which none is beyond {highest.tolist()}")
                 self._env.account_charges = charges
                 integrals_of_budgets = np.array(state["lasting_budget_price"], dtype=np.float64)
-                self._budget_integrals = np.broadcast_to(integrals_of_budgets, len(self._budgets)).copy()
+                self._budget_integrals = np.broadcast_to(integrals_of_budgets, budgets).copy()
         except (CirlError, KeyError, TypeError, ValueError) as error:
             raise RunError(f"{path}: cannot be read: {error!r}; it holds the price of service") from error
         self._env.circularity_weight, self._integrals = weight, integrals

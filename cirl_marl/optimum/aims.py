@@ -86,12 +86,21 @@ class Aims:
 
     def bookings(self, run: Rollout) -> Floats:
         """Return what each episode of a rollout books of each budget, shape (episodes, budgets)."""
-        amounts = np.empty((len(run.accounts), len(self.budgets)))
+        return self.amounts(run.accounts, run.bookings)
+
+    def amounts(self, totals: Floats, bookings: Floats) -> Floats:
+        """Return what is booked of each budget, shape (episodes, budgets).
+
+        Args:
+            totals: of accounts, discounted, shape (episodes, accounts).
+            bookings: of intervals, not discounted, shape (episodes, accounts, steps).
+        """
+        amounts = np.empty((len(totals), len(self.budgets)))
         for column, budget in zip(amounts.T, self.budgets, strict=True):
             if budget.year is None:
-                column[:] = run.accounts[:, budget.account]
+                column[:] = totals[:, budget.account]
             else:
-                column[:] = run.bookings[:, budget.account, budget.year].sum(axis=1)
+                column[:] = bookings[:, budget.account, budget.year].sum(axis=1)
         return amounts
 
     def counts(self, ledger: Ledger) -> Floats:
@@ -114,15 +123,10 @@ class Aims:
         by_flow, by_stock, by_control = (rates[accounts] * counts for rates in ledger.rates(with_discount=False))
         return by_flow, by_stock, by_control
 
-    def refuse_years(self, subject: str, reason: str) -> None:
-        """Refuse budgets per year.
-
-        Raises:
-            CirlError: naming the ``subject`` that keeps none of them, an account that has one, and the ``reason``.
-        """
-        for budget in self.budgets:
-            if budget.year is not None:
-                raise CirlError(f"{subject}: no budget per year, as of {budget.name}, can be kept: {reason}")
+    @property
+    def has_years(self) -> bool:
+        """Whether some budget is of a year."""
+        return any(budget.year is not None for budget in self.budgets)
 
     @property
     def limits(self) -> Floats:
@@ -201,6 +205,8 @@ def aims_of(network: Network, aim: Aim, at_most: Mapping[str, float] | None) -> 
     budgets: list[Budget] = []
     for name, most in (at_most or {}).items():
         account, _, period = str(name).partition("/")
+        if not account:
+            raise CirlError(f"at_most: '{name}' names no account; write one before it, as in 'NAME{PER_YEAR}'")
         if account not in accounts:
             raise CirlError(f"network '{network.name}': at_most: {unknown_name('account', account, accounts)}")
         if name not in (account, account + PER_YEAR):

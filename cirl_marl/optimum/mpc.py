@@ -35,7 +35,7 @@ from cirl_marl.network.innovations import innovations
 from cirl_marl.network.substances import CONTENT
 from cirl_marl.network.uncertainty import expected_network
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.aims import Aim, Aims, aims_of
+from cirl_marl.optimum.aims import NO_AIMS, Aim, Aims, aims_of
 from cirl_marl.optimum.draws import Prices
 from cirl_marl.optimum.futures import DrawnFutures
 from cirl_marl.optimum.options import check_margin, check_options, demanded_levels, starting_stocks, with_margin
@@ -162,7 +162,7 @@ class MPC(Planner):
                 ``service_weight``.
             service_weight: w ≥ 0; goes with the aim ``circularity``.
             aim: see ``bound``.
-            at_most: budgets, likewise; in a certain network without a ``horizon``, per year in no other.
+            at_most: budgets, likewise; in a certain network without a ``horizon``.
             degree: degree of the test polynomials; see ``bound``.
             replan: decisions carried out of each plan; None: 4, in a disturbed network 1.
             futures: how many are drawn at every decision in a disturbed network; None: one, in which all is as it is
@@ -212,8 +212,6 @@ class MPC(Planner):
             raise CirlError(f"network '{env.network.name}': {fault}; take 'optimum' or a learner")
         network, (horizon, replan, futures) = env.network, self._options
         self._aims = aims = aims_of(network, self._aim, self._at_most)
-        if network.disturbed:
-            aims.refuse_years("MPC", "what is charged for in a disturbed network is a total; take optimum control")
         self._levels = None if self._min_service is None else demanded_levels(network, self._min_service)
         self.note, self._env, is_disturbed = "", env, bool(network.disturbed)
         if self._prices is not None and len(self._prices.service) > len(network.services):
@@ -234,7 +232,7 @@ class MPC(Planner):
         self._outlooks: dict[int, WindowPlan] = {}
         self._common_outlook: WindowPlan | None = None
         self._price = np.zeros(0)
-        self._bookings = _Bookings(aims, env)
+        self._bookings = _Bookings(NO_AIMS if is_disturbed else aims, env)  # there what is booked has its charges
         is_short = self._horizon is not None and self._horizon < network.episode.horizon
         if is_disturbed and (is_short or self._levels is not None or aims.budgets):
             self._common_outlook = outlook = self._expected_outlook()

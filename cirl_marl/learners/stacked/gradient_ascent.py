@@ -32,8 +32,10 @@ from cirl_marl.learners.learner import Learner
 from cirl_marl.learners.recipe import Run
 from cirl_marl.learners.stacked.perceptrons import Weights, chain, write_gradients
 from cirl_marl.learners.stacked.stack import Stack
-from cirl_marl.learners.validation import FIRST_BUDGET_PRICE, QUANTILE_95, budget_levels, charges_of, price_step
+from cirl_marl.learners.validation import QUANTILE_95, budget_levels, charges_of, first_prices, price_step
 from cirl_marl.network import Floats
+from cirl_marl.network.elements import CIRCULARITY
+from cirl_marl.optimum.aims import aims_of
 
 FEEDBACK = 0.5
 """Share of a derivative that passes on to what was before through what a policy saw: where agents act on each other
@@ -64,9 +66,9 @@ class GradientStack(Stack):
         stated = np.array([service.weight for service in self._env.network.services]) * (1.0 - weight) / weight
         self._prices: Floats = getattr(first, "service_prices", stated)
         self._integrals: Floats = getattr(first, "price_integrals", np.maximum(stated, LEAST_PRICE))
-        accounts = self._env.ledger.accounts
-        self._budgets = {accounts.index(account): most for account, most in run.at_most.items()}
-        start = np.full(len(self._budgets), FIRST_BUDGET_PRICE)
+        network = self._env.network
+        self._aims = aims_of(network, CIRCULARITY, run.at_most)
+        start = first_prices(self._aims, network.episode.horizon)
         self._budget_prices: tuple[Floats, Floats] = getattr(first, "budget_prices", (start, start))
         self._charges = np.array(self._env.account_charges)
 
@@ -135,14 +137,15 @@ class GradientStack(Stack):
         count = length * env.num_envs
         by_circularity = np.full(env.num_envs, 1.0 / (env.network.objective.circularity_scale * count))
         by_level = np.repeat(self._prices[:, None] / count, env.num_envs, axis=1)
-        charges = self._charges + charges_of(env, self._budgets, self._budget_prices[1])
-        by_account = np.repeat(-charges[:, None] * by_circularity[0] * length, env.num_envs, axis=1)
+        charges = self._charges[:, None] + charges_of(env, self._aims, self._budget_prices[1])
+        by_account = -charges * by_circularity[0] * length
         after = self._tape[-1][0].after
         stock, paths = np.zeros_like(after.stock), np.zeros_like(after.disturbances)
         seen = np.zeros((max(span.stop for span in self._observed), env.num_envs))
         gradients: list[list[Tensor]] = []
         for interval, values, slopes in reversed(self._tape):
-            outputs = Outputs(stock, by_circularity, by_level, seen, by_account)
+            columns = np.minimum(interval.before.step, by_account.shape[1] - 1)
+            outputs = Outputs(stock, by_circularity, by_level, seen, by_account.take(columns, axis=1))
             stock, by_action, _ = self._derivatives.pull_back(interval, outputs, paths)
             gradients.insert(0, chain(weights.actor, values, self._by_output(by_action, values[-1])))
             by_input = gradients[0][0].cpu().numpy() * slopes
@@ -155,7 +158,7 @@ class GradientStack(Stack):
         weights.optimiser.step()
         self._updates += 1
         levels = after.service / length
-        self._move_prices(levels, after.accounts)
+        self._move_prices(levels, self._amounts())
         self._log(float(after.circularity.mean()) / length, levels.mean(axis=1), rate)
 
     def _by_output(self, by_action: Floats, outputs: Tensor) -> Tensor:
@@ -167,10 +170,19 @@ class GradientStack(Stack):
         gradient[((beyond > 1.0) & (gradient < 0.0)) | ((beyond < -1.0) & (gradient > 0.0))] = 0.0
         return torch.as_tensor(gradient, device=self._device)
 
-    def _move_prices(self, levels: Floats, accounts: Floats) -> None:
+    def _amounts(self) -> Floats:
+        """Return what the episode booked of each budget in each copy, shape (B, budgets)."""
+        intervals = [interval for interval, _, _ in self._tape]
+        totals, discount = intervals[-1].after.accounts.T, self._env.ledger.discount
+        if not self._aims.has_years:
+            return self._aims.amounts(totals, totals[..., None])
+        changes = np.stack([each.after.accounts - each.before.accounts for each in intervals], axis=-1)
+        return self._aims.amounts(totals, changes.transpose(1, 0, 2) / discount)
+
+    def _move_prices(self, levels: Floats, amounts: Floats) -> None:
         """Move them by what nineteen of twenty evaluations assure whose episodes are like these.
 
-        ``levels`` have shape (services, B), totals of ``accounts`` (accounts, B).
+        ``levels`` have shape (services, B), what is booked of budgets (B, budgets).
         """
         run = self._run
         if run.min_service is None:
@@ -184,8 +196,8 @@ class GradientStack(Stack):
 
         min_service = run.min_service
         self._integrals, self._prices = step_prices(self._integrals, levels)
-        if self._budgets:
-            levels_of_budgets = budget_levels(self._budgets, accounts, min_service)
+        if self._aims.budgets:
+            levels_of_budgets = budget_levels(self._aims, amounts, min_service)
             self._budget_prices = step_prices(self._budget_prices[0], levels_of_budgets)
 
     def _log(self, circularity: float, levels: Floats, rate: float) -> None:
