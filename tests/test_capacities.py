@@ -198,3 +198,14 @@ def test_capacities_that_cannot_be_meant_are_refused(arc: str, change: dict[str,
     arcs = [replace(each, **change) if each.id == arc else each for each in network.arcs]
     with pytest.raises(NetworkError, match=f"(?s)arc '{arc}'.*{message}"):
         replace(network, arcs=tuple(arcs))
+
+
+@pytest.mark.parametrize(
+    ("law", "reason"), [(Law.DONOR, "would not be linear in stocks"), (Law.BATCH, "leaves at once")]
+)
+def test_only_orders_have_capacities(law: Law, reason: str) -> None:
+    """What flows in proportion to a stock, and what leaves in batches, is refused, each with its reason."""
+    arc = Arc(id="out", donor="plant", recipient="sink", law=law, rate=0.1, capacity_node="plant", capacity_rate=1.0)
+    nodes = tuple(Node(id=id_, initial=(1.0, 1.0)) for id_ in ("plant", "sink"))
+    with pytest.raises(NetworkError, match=f"capacity_node needs law 'controlled', not '{law}': .*{reason}"):
+        Network(name="plants", nodes=nodes, arcs=(arc,))

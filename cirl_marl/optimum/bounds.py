@@ -442,7 +442,8 @@ def _unreachable(problem: Program, min_service: Floats | None, aims: Aims) -> st
             for budget, excess in zip(aims.budgets, excesses, strict=True)
             if excess > 0
         ]
-        return f"network '{network.name}': no actions keep the budget of {', '.join(least)}"
+        price = "its price would be infinite" if len(least) == 1 else "their prices would be infinite"
+        return f"network '{network.name}': no actions keep the budget of {', '.join(least)}: {price}"
     return _unreached_services(problem, min_service)
 
 

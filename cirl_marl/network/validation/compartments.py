@@ -89,6 +89,8 @@ def _capacity_problems(subject: str, arc: Arc, nodes: Mapping[str, Node]) -> Ite
         yield f"{subject}: capacity_node: it needs a capacity_rate above 0, the flow that a unit of the stock can carry"
     if arc.law is not Law.CONTROLLED:
         reason = "what a proportion of a stock may carry would not be linear in stocks"
+        if arc.law is Law.BATCH:
+            reason = "a batch leaves at once, and no flow could be held below a capacity"
         yield f"{subject}: capacity_node needs law 'controlled', not '{arc.law}': {reason}"
     elif arc.makes_up_for:
         yield f"{subject}: capacity_node: what makes up for a service has the bounds of its control; leave out one"
