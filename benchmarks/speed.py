@@ -37,6 +37,7 @@ from benchmarks.generated import (
     simple_spread,
     yearly_network,
 )
+from benchmarks.variants import without_substances
 from cirl_marl import load_network, parallel_env
 from cirl_marl.environments.derivatives import Derivatives
 from cirl_marl.environments.parallel import NetworkParallelEnv
@@ -78,6 +79,7 @@ class Measurement(StrEnum):
     WORLD = "world"
     DISTURBED = "disturbed"
     GRADIENTS = "gradients"
+    SUBSTANCES = "substances"
     ACCELERATOR = "accelerator"
 
 
@@ -411,6 +413,25 @@ def disturbances() -> list[Figure]:
     return [Figure(what, f"{ratio:.0%}", "≥ 70 %", ratio >= 0.7, "whole episodes, restarts included; median of rounds")]
 
 
+def substances() -> list[Figure]:
+    """Measure networks with a substance against the same without: who acts on the substance alone is left out."""
+    figures = []
+    for name, scenario in (("steel_japan", "copper"), ("aluminium_world", "alloys")):
+        network = load_network(name, scenario=scenario)
+        envs = [MultiAgentVectorEnv(each, num_envs=WORLDS) for each in (network, without_substances(network))]
+        blocks = []
+        for env in envs:
+            env.reset(seed=0)
+            step = partial(env.step, _actions(env.agents, (WORLDS, 1)))
+            blocks.append(partial(_seconds, step, network.episode.horizon))
+        with_, without = _interleaved(9, *blocks)
+        ratio = median(a / b for a, b in zip(with_, without, strict=True))
+        what = f"{name} with {scenario}, {WORLDS} copies / without the substance"
+        rates = " and ".join(f"{WORLDS / min(costs):,.0f}" for costs in (with_, without))
+        figures.append(Figure(what, f"{ratio:.2f} ×", "≤ 1.5 ×", ratio <= 1.5, f"{rates} intervals/s, best of rounds"))
+    return figures
+
+
 def gradients() -> list[Figure]:
     """Measure an episode with its exact gradient by actions, start and disturbances against the episode alone."""
     figures = []
@@ -464,7 +485,10 @@ def accelerator() -> list[Figure]:
 MEASURES: dict[Measurement, Callable[[], list[Figure]]] = dict(
     zip(
         Measurement,
-        (batched, single, share, lockstep, stacked, arcs, yearly, world, disturbances, gradients, accelerator),
+        (
+            *(batched, single, share, lockstep, stacked, arcs, yearly, world, disturbances, gradients),
+            *(substances, accelerator),
+        ),
         strict=True,
     )
 )

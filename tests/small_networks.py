@@ -11,6 +11,7 @@ from hypothesis import assume
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from benchmarks.variants import without_substances
 from cirl_marl import (
     Account,
     Arc,
@@ -224,17 +225,6 @@ def without_lifetimes(network: Network) -> Network:
             node = replace(node, control=control, initial=initial, content=content, **plain)
         nodes.append(node)
     return replace(network, nodes=tuple(nodes))
-
-
-def without_substances(network: Network) -> Network:
-    """Return the network with nothing said of what is in it."""
-    arcs = []
-    for arc in network.arcs:
-        sets_transfer = arc.control is not None and arc.control.kind is ControlKind.TRANSFER
-        arcs.append(replace(arc, transfer=(), control=None if sets_transfer else arc.control))
-    nodes = tuple(replace(node, content=()) for node in network.nodes)
-    services = tuple(service for service in network.services if not service.substance)
-    return replace(network, nodes=nodes, arcs=tuple(arcs), services=services, substances=(), scenarios={})
 
 
 plain_networks = st.from_type(Network).map(without_lifetimes).map(without_substances)
