@@ -227,10 +227,10 @@ def random_network(seed: int, nodes: int, arcs: int, *, runge_kutta: bool = Fals
     return network.with_options(episode={"solver": "rk4", "solver_step": step})
 
 
-def with_substances(network: Network, seed: int) -> Network:
+def with_substances(network: Network, seed: int, *, batches: bool = False) -> Network:
     """Return a network with one or two substances, some of which nodes separate, and limits on contents.
 
-    Batches and what recipients draw become schedules, as they do not follow substances.
+    What recipients draw becomes a schedule, as it does not follow substances, and so do batches unless they are kept.
     """
     rng = np.random.default_rng([seed, 3])
     names = [f"substance_{i}" for i in range(int(rng.integers(1, 3)))]
@@ -243,7 +243,7 @@ def with_substances(network: Network, seed: int) -> Network:
     rests = {arc.donor for arc in network.arcs if arc.law is Law.SHARE and arc.share is None and arc.control is None}
     arcs = []
     for arc in network.arcs:
-        if arc.law in (Law.BATCH, Law.RECIPIENT):
+        if arc.law is Law.RECIPIENT or (arc.law is Law.BATCH and not batches):
             flow = float(rng.uniform(0, 50))
             arc = Arc(id=arc.id, donor=arc.donor, recipient=arc.recipient, law=Law.EXOGENOUS, flow=flow)
         elif arc.law is Law.SHARE and arc.donor in rests and not (arc.share is None and arc.control is None):
@@ -271,7 +271,7 @@ def with_substances(network: Network, seed: int) -> Network:
     network = replace(
         network, nodes=tuple(nodes), arcs=tuple(arcs), services=tuple(services), substances=substances, scenarios={}
     )
-    return with_changing_contents(network, seed) if rng.random() < 0.5 else network
+    return with_changing_contents(network, seed) if not batches and rng.random() < 0.5 else network
 
 
 def with_changing_contents(network: Network, seed: int) -> Network:

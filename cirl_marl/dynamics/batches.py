@@ -8,6 +8,9 @@ interval, or when the model of the compartment ``by`` has completed one, at its 
     collecting --complete--> packed --vehicle at the donor--> aboard --arrived--> recipient
     collecting --complete--> slots, n intervals --> recipient
 
+In a network with substances a batch has the content of its donor when it leaves: each component has rows of its own,
+and leaves in the part that it has of the donor's stock.
+
 Mass is only ever taken from one row and added to another. m_fb, the net batch mass moved finite-time sustainably, has
 two parts: that not through the environment and that through it.
 """
@@ -20,29 +23,32 @@ from cirl_marl.dynamics.inner_physics import InnerPhysics
 from cirl_marl.dynamics.state_layout import BatchLine, StateLayout
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import Law
-from cirl_marl.network.rowsum import RowSum, disposable
+from cirl_marl.network.rowsum import NEGLIGIBLE, RowSum, disposable
 
 
 class BatchTransport:
     """The batch arcs of a network, compiled.
 
     Attributes:
-        arcs: position of each batch arc among the arcs.
-        lines: the batch arcs.
+        arcs: position of each batch arc among the arcs, of one component after the other.
+        lines: the batch arcs, of the whole.
     """
 
     def __init__(self, network: Network, rows: StateLayout) -> None:
         """Compile the batch arcs, whose rows are those of ``rows``."""
-        self._network, self._rows, self.lines = network, rows, rows.lines
+        self._network, self._rows = network, rows
+        self.lines = rows.lines[: len(rows.lines) // rows.components]
         self.arcs = [k for k, arc in enumerate(network.arcs) if arc.law is Law.BATCH]
         self._model_lines = [line for line in self.lines if line.by]
         self._vehicles = [(i, line) for i, line in enumerate(self.lines) if not line.slots]
         self._recipients = sorted({line.recipient for line in self.lines})
-        count, positions, lines = len(self.lines), np.arange(len(self.lines)), self.lines
+        lines = rows.lines
+        count, positions = len(lines), np.arange(len(lines))
         self._delivery = RowSum([line.recipient for line in lines], positions, 1.0, (rows.masses, count))
         self._arrivals = RowSum([line.part for line in lines], positions, [line.arrives for line in lines], (2, count))
-        places = [(i, row) for i, line in enumerate(lines) for row in line.rows]
-        self._load_sum = RowSum([i for i, _ in places], [row for _, row in places], 1.0, (count, rows.masses))
+        whole = len(self.lines)
+        places = [(i % whole, row) for i, line in enumerate(lines) for row in line.rows]
+        self._load_sum = RowSum([i for i, _ in places], [row for _, row in places], 1.0, (whole, rows.masses))
         self._slot_lines = np.flatnonzero([line.slots > 0 for line in lines])
         self._first = np.array([lines[i].first for i in self._slot_lines], dtype=np.intp)[:, None]
         self._slots = np.array([lines[i].slots for i in self._slot_lines], dtype=np.intp)[:, None]
@@ -50,10 +56,11 @@ class BatchTransport:
 
     def _compile_schedule(self) -> None:
         """Collect the masses that leave on schedule, and the donors of them."""
-        network, lines = self._network, [line for line in self.lines if not line.by]
-        count = len(lines)
-        self._schedule = np.zeros((count, network.episode.horizon))
-        for masses, line in zip(self._schedule, lines, strict=True):
+        network, lines = self._network, [line for line in self._rows.lines if not line.by]
+        components, count = self._rows.components, len(lines)
+        whole, self._stores = count // components, self._rows.nodes.stop // components
+        self._schedule = np.zeros((whole, network.episode.horizon))
+        for masses, line in zip(self._schedule, lines, strict=False):
             for time, mass in network.arcs[network.arc_index[line.id]].batches:
                 step = round(time / network.episode.control_interval)
                 if step < len(masses):
@@ -62,6 +69,7 @@ class BatchTransport:
         self._sent_slots = np.array([line.slots for line in lines], dtype=np.intp)[:, None]
         self._sent_donor = np.array([line.donor for line in lines], dtype=np.intp)
         self._departure = RowSum(self._sent_donor, np.arange(count), -1.0, (self._rows.masses, count))
+        self._demand = RowSum(self._sent_donor[:whole], np.arange(whole), 1.0, (self._rows.masses, whole))
         parts, weights = [line.part for line in lines], [line.leaves for line in lines]
         self._departures = RowSum(parts, np.arange(count), weights, (2, count))
 
@@ -73,21 +81,36 @@ class BatchTransport:
         mass = self._schedule[:, step]
         if not mass.any():
             return np.zeros((2, stock.shape[1]))
-        demand, remainder = -self._departure(mass), self._departure.add_to(stock.copy(), mass)
-        share = np.divide(disposable(stock, len(mass)), demand, out=np.ones_like(demand), where=remainder < 0)
-        mass = mass * share.take(self._sent_donor, axis=0)
+        demand, donors = self._demand(mass), self._sent_donor[: len(mass)]
+        if self._rows.components == 1:
+            available, is_short = stock, self._departure.add_to(stock.copy(), mass) < 0
+        else:
+            available = self._wholes(stock)
+            is_short = demand > disposable(available, len(mass))
+        share = np.divide(disposable(available, len(mass)), demand, out=np.ones_like(demand), where=is_short)
+        mass = mass * share.take(donors, axis=0)
+        if self._rows.components > 1:
+            whole = available.take(donors, axis=0)
+            part = np.divide(mass, whole, out=np.zeros_like(mass), where=whole > NEGLIGIBLE)
+            mass = np.tile(part, (self._rows.components, 1)) * stock.take(self._sent_donor, axis=0)
         self._departure.add_to(stock, mass)
         # the slot that is read at the end of the last interval of the delay
         stock[self._sent_first + (step - 1) % self._sent_slots, np.arange(stock.shape[1])] += mass
         return self._departures(mass)
 
+    def _wholes(self, stock: Floats) -> Floats:
+        """Return what nodes hold of all components, in the rows of the first, shape (masses, B)."""
+        whole = stock.copy()
+        whole[: self._stores] = stock[self._rows.nodes].reshape(-1, self._stores, stock.shape[1]).sum(axis=0)
+        return whole
+
     def settle(self, stock: Floats, inner: Floats, step: Integers, physics: InnerPhysics) -> tuple[Floats, Floats]:
         """Deliver, release and send off, in place, what is due at the end of the interval ``step``, shape (B,).
 
-        Vehicles turn and plants receive in ``inner``. Returned are the mass delivered by each batch arc, shape (batch
-        arcs, B), and m_fb of the interval's end, shape (2, B).
+        Vehicles turn and plants receive in ``inner``. Returned are the mass delivered by each of ``arcs``, shape (arcs,
+        B), and m_fb of the interval's end, shape (2, B).
         """
-        deliveries = np.empty((len(self.lines), stock.shape[1]))
+        deliveries = np.empty((len(self.arcs), stock.shape[1]))
         slots, copies = self._first + step % self._slots, np.arange(stock.shape[1])
         deliveries[self._slot_lines] = stock[slots, copies]
         stock[slots, copies] = 0.0

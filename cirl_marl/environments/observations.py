@@ -175,10 +175,11 @@ class ObservationLayout:
         self.array_order = self._common_order(agents, mode)
         scales = np.array([c.scale for c in network.compartments.values()])
         inside = np.ones(signals.loads.start - signals.states.start)
-        inverse_scale = 1.0 / np.concatenate([scales, inside, scales[signals.flows][batches.arcs]])
+        batch_arcs = batches.arcs[: len(batches.lines)]
+        inverse_scale = 1.0 / np.concatenate([scales, inside, scales[signals.flows][batch_arcs]])
         of_substances = [1.0 / substance.scale for substance in network.substances]
         inverse_scale = np.concatenate([inverse_scale, np.repeat(of_substances, len(scales))])
-        inverse_scale[signals.flows][batches.arcs] *= network.episode.control_interval
+        inverse_scale[signals.flows][batch_arcs] *= network.episode.control_interval
         # equal shapes are faster than a broadcast
         self._inverse_scale = np.repeat(inverse_scale[:, None], batch, axis=1)
         set_points = np.array([c.set_point or 0.0 for c in network.compartments.values()]) / scales

@@ -88,7 +88,7 @@ def _transfer_problems(arc: Arc, substances: list[str]) -> Iterator[str]:
 
 
 def _service_problems(network: Specification, substances: list[str]) -> Iterator[str]:
-    makes_up = {arc.makes_up_for for arc in network.arcs}
+    makes_up, arcs = {arc.makes_up_for for arc in network.arcs}, {arc.id for arc in network.arcs}
     for service in network.services:
         subject = f"service '{service.id}': substance"
         if not service.substance:
@@ -97,6 +97,9 @@ def _service_problems(network: Specification, substances: list[str]) -> Iterator
             yield f"{subject}: {unknown_name('substance', service.substance, substances)}"
         if service.quantity == "measure":
             yield f"{subject}: a measure of a model has no content; ask for that of a stock or flow"
+        on_the_way = [id_ for id_ in service.providers if service.quantity == "stock" and id_ in arcs]
+        if on_the_way:
+            yield f"{subject}: no content is measured of what is on the way along '{on_the_way[0]}'; ask for its flow's"
         if service.id in makes_up:
             yield f"{subject}: no flow makes up for a content; leave out makes_up_for"
 
@@ -111,5 +114,5 @@ def _motion_problems(network: Specification) -> Iterator[str]:
             kind = type(compartment).__name__.lower()
             yield f"{kind} '{compartment.id}': model: inner physics does not follow substances"
     for arc in network.arcs:
-        if arc.law in (Law.BATCH, Law.RECIPIENT, Law.COMPARTMENT):
+        if arc.law in (Law.RECIPIENT, Law.COMPARTMENT):
             yield f"arc '{arc.id}': law '{arc.law}' does not follow substances; take 'donor', 'share' or a schedule"
