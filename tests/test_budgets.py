@@ -201,7 +201,7 @@ def test_plans_are_compared_by_what_they_exceed() -> None:
     assert merits[0] == plan.value
     future = control._planner.futures[0]
     charged = replace(plan.task, charges=np.array([50.0]))
-    values = [future.carry_out(task, plan.actions)[2] for task in (plan.task, charged)]
+    values = [future.carry_out(task, plan.actions).value for task in (plan.task, charged)]
     assert values[0] - values[1] == pytest.approx(50.0 * float(plan.bookings.sum()))
 
 
@@ -221,8 +221,9 @@ def test_the_rest_of_a_plan_stays_where_a_new_one_is_worse() -> None:
     control = MPC(min_service=0.95, at_most={"emissions": halfway(network)})
     plan = first_window(control, network)
     idle = np.full_like(plan.actions, -1.0)
-    level, bookings, value = control._planner.futures[0].carry_out(plan.task, idle)
-    worse = replace(plan, actions=idle, level=np.minimum(level, 1.0).mean(axis=0), bookings=bookings, value=value)
+    outcome = control._planner.futures[0].carry_out(plan.task, idle)
+    level = np.minimum(outcome.level, 1.0).mean(axis=0)
+    worse = replace(plan, actions=idle, level=level, bookings=outcome.bookings, value=outcome.value)
     assert (control._planner.better_of(worse, plan.actions).actions == plan.actions).all()
     assert control._planner.better_of(plan, worse.actions) is plan
 

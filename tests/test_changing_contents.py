@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from cirl_marl import (
     MPC,
     Arc,
-    CirlError,
     Control,
     ControlKind,
     Episode,
@@ -33,11 +32,14 @@ from cirl_marl import (
     load_network,
     simulate_plan,
 )
+from cirl_marl.controllers import Neutral
+from cirl_marl.controllers.rollout import rollout
 from cirl_marl.definitions.writer import definition_of
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network.disturbances import AutoRegression, DisturbanceEffect, Markov
 from cirl_marl.network.elements import Lifetime
 from cirl_marl.network.uncertainty import Spread, network_of_intervals
+from cirl_marl.optimum.content_ranges import present_contents
 from cirl_marl.optimum.draw_proofs import Sampling
 
 HISTORY = Series(times=(-5.0,), values=(1.0,))
@@ -410,16 +412,27 @@ def test_uncertain_bounds_of_disturbed_contents() -> None:
     assert limit.value < circularity.mean() + 2.0
 
 
-def test_mpc_follows_stated_contents_and_refuses_disturbed_ones() -> None:
-    """Windows know what is stated; of a disturbance of contents they would not know what stocks have in them."""
-    network = mine()
-    network = replace(network, services=network.services[:1])
-    env = MultiAgentVectorEnv(network, num_envs=1)
-    env.reset(seed=0)
-    MPC(min_service=0.9).start(env, 0)
-    network = replace(unforeseen(), services=network.services)
-    with pytest.raises(CirlError, match=r"MPC plans masses, not contents, of which nodes\.ore\.content\.copper"):
-        MPC(min_service=0.9).start(MultiAgentVectorEnv(network, num_envs=1), 0)
+@pytest.mark.parametrize("futures", [None, 2])
+def test_mpc_plans_for_disturbed_contents_as_expected(futures: int | None) -> None:
+    """From stocks with whatever is in them: both services come out better than as usual, in every copy."""
+    means = []
+    for controller in (MPC(min_service=1.0, futures=futures), Neutral()):
+        env = MultiAgentVectorEnv(unforeseen(), num_envs=6)
+        means.append(rollout(env, controller, seed=3).episode_levels.mean(axis=0))
+        if isinstance(controller, MPC):
+            assert not controller.note
+    assert (means[0] >= 0.97).all() and (means[1] < 0.85).all()
+
+
+def test_present_contents_are_those_of_the_copies() -> None:
+    """From the least to the greatest part of each component in any copy, and stage."""
+    env, _ = rollout_of(unforeseen(), 5, 1)
+    least, most = present_contents(env.rows, env.physical.stock)
+    parts = env.physical.stock[[i + 3 * c for c in range(3) for i in (1, 2)]].reshape(3, 2, 5)
+    parts = parts / parts.sum(axis=0)
+    np.testing.assert_allclose(least[:, 1:], parts.min(axis=2), rtol=1e-12)
+    np.testing.assert_allclose(most[:, 1:], parts.max(axis=2), rtol=1e-12)
+    assert (least[1:, 1:] < most[1:, 1:]).all()
 
 
 def changed(**changes: Any) -> Network:

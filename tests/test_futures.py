@@ -69,7 +69,7 @@ def test_programs_are_those_of_each_copy_alone(network: str, scenario: str, coun
         stock = env.physical.stock[env.rows.nodes, copy]
         for future in futures:
             path = env.network.processes.prior_means(env.network.episode.horizon)
-            place = future._places(intervals).start
+            place = future.places(intervals).start
             path[3:6] = COURSES[-1][place : place + 3]
             np.testing.assert_allclose(path[3], values[:, copy], rtol=1e-12)  # what is, is as it is
             admissible = Admissible.of(draw_network(world, (), path), env.agents)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -12,8 +13,8 @@ import pytest
 from conftest import random_network, with_substances
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from small_networks import without_substances
 
+from benchmarks.variants import without_substances
 from cirl_marl import (
     MPC,
     Account,
@@ -37,6 +38,7 @@ from cirl_marl import (
     simulate,
     simulate_plan,
 )
+from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
 from cirl_marl.definitions.writer import definition_of
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.environments.vector import MultiAgentVectorEnv
@@ -48,7 +50,12 @@ from cirl_marl.network.uncertainty import Spread, draw_network
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.draw_proofs import Sampling
 from cirl_marl.optimum.linearised import jacobians, step_program
+from cirl_marl.optimum.options import by_stage, with_margin
 from cirl_marl.optimum.program import LARGE
+from cirl_marl.optimum.window_planner import Future
+from cirl_marl.optimum.windows import WindowTask
+from cirl_marl.reasons.inverse import infer
+from cirl_marl.reasons.objective_terms import PlannedEpisode, service_levels
 from cirl_marl.reasons.prices import shadow_prices
 
 substances_networks = st.builds(
@@ -808,11 +815,111 @@ def test_bounds_allow_what_idle_supplies_bring(refilled: bool) -> None:
     assert run.episode_circularity[0] <= limit.objective + 1e-6
 
 
-def test_mpc_refuses_services_of_contents() -> None:
-    """Its windows correct levels of masses."""
-    env = MultiAgentVectorEnv(EXAMPLE, num_envs=1)
-    with pytest.raises(CirlError, match=r"MPC plans masses, not contents, of which clean_flat, clean_long are"):
-        MPC(min_service=0.99).start(env, 0)
+def controlled_by_mpc(network: Network, horizon: int | None, demanded: float) -> Rollout:
+    """Return an episode of MPC from the middle of the initial ranges."""
+    env = MultiAgentVectorEnv(network, num_envs=1)
+    start = episode_start(env)
+    return rollout(env, MPC(horizon=horizon, min_service=demanded), seed=start.seed, start=start.initial_state)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("horizon", "worst"), [(6, -10.5), (10, -8.6), (None, -7.95)])
+def test_mpc_keeps_contents(horizon: int | None, worst: float) -> None:
+    """As usual it were -28.5 Mt, the plan has -7.93; a window of six years ends before what is made now is scrap."""
+    run = controlled_by_mpc(load_network(EXAMPLE), horizon, 1.0)
+    assert run.least_service[0] >= 0.9999
+    assert run.episode_circularity[0] >= worst
+
+
+def sorter(limit: float = 0.02, **service: Any) -> Network:
+    """Return ore without copper and scrap with 4 % of it that make one product."""
+    order = Control(kind=ControlKind.FLOW, low=0.0, neutral=2.0, high=10.0)
+    place: dict[str, Any] = {"provider": "made", "quantity": "flow"}
+    return Network(
+        name="sorter",
+        nodes=(
+            Node(id="ore", role=Role.NONRENEWABLE_RESERVOIR, initial=(500.0, 500.0)),
+            Node(id="scrap", initial=(100.0, 100.0), content={"copper": 0.04}),
+            Node(id="melt", stores=False),
+            Node(id="use", initial=(50.0, 50.0), rate=0.1, content={"copper": limit / 2}),
+            Node(id="landfill", role=Role.LANDFILL),
+        ),
+        arcs=(
+            Arc(id="mined", donor="ore", recipient="melt", law=Law.CONTROLLED, control=order),
+            Arc(id="melted", donor="scrap", recipient="melt", law=Law.CONTROLLED, control=order),
+            Arc(id="made", donor="melt", recipient="use", law=Law.SHARE),
+            Arc(id="left", donor="use", recipient="landfill", law=Law.SHARE),
+        ),
+        services=(
+            Service(id="products", provider="made", quantity="flow", low=6.0, owed_by=("mined",)),
+            Service(id="clean", substance="copper", owed_by=("mined",), **place | service),
+        ),
+        substances=COPPER,
+        mass_unit="t",
+        time_unit="year",
+        episode=Episode(control_interval=1.0, horizon=6),
+    )
+
+
+@pytest.mark.parametrize("horizon", [2, None])
+def test_mpc_takes_as_much_scrap_as_the_limit_allows(horizon: int | None) -> None:
+    """Of ore without copper and scrap with 4 % half may be scrap where 2 % are allowed, three quarters of 3 %."""
+    for limit, part in ((0.02, 0.5), (0.03, 0.75)):
+        run = controlled_by_mpc(sorter(limit, low=0.0, high=limit), horizon, 1.0)
+        np.testing.assert_allclose(run.flow[:, :2], np.tile([6 * (1 - part), 6 * part], (6, 1)), rtol=1e-3)
+        assert run.least_service[0] >= 1.0 - 1e-4
+
+
+@pytest.mark.parametrize("horizon", [2, None])
+def test_mpc_keeps_least_contents_and_those_of_stocks(horizon: int | None) -> None:
+    """A product that must have copper takes scrap for it; what is in use counts by its stock."""
+    run = controlled_by_mpc(sorter(low=0.03), horizon, 1.0)
+    assert run.contents[:, 0, 7].min() >= 0.03 - 1e-5  # with as much ore as scrap it were 0.02
+    run = controlled_by_mpc(sorter(low=0.0, high=0.015, provider="use", quantity="stock"), horizon, 1.0)
+    assert run.least_service[0] >= 1.0 - 1e-4
+    assert run.contents[-1, 0, 2] == pytest.approx(0.015, rel=2e-2)
+
+
+def test_margins_of_contents_are_stricter() -> None:
+    """A limit is divided by the margin, a least content multiplied."""
+    products, clean = with_margin(sorter(low=0.01, high=0.02), 1.25).services
+    assert (products.low, clean.low, clean.high) == (7.5, 0.0125, 0.016)
+
+
+def test_levels_of_contents_in_windows_are_those_of_the_simulator() -> None:
+    """Whatever actions do, and of both ends of a band; nothing at all is as good as what is wanted."""
+    network = sorter(low=0.01, high=0.02)
+    future = Future(Admissible.of(network), 2, None)
+    start = by_stage(network, future.dynamics.rows, network.initial[0])
+    task = WindowTask(start, range(6), None, None, np.zeros(0), None)
+    actions = np.random.default_rng(0).choice([-1.0, -0.6, 0.0, 1.0], (6, 2))
+    actions[0] = -1.0
+    env = MultiAgentVectorEnv(network, num_envs=1)
+    env.reset(seed=0)
+    sums = []
+    for action in actions:
+        env.advance(action[:, None])
+        sums.append(env.physical.service[:, 0])
+    levels = np.diff(sums, axis=0, prepend=0.0)
+    outcome = future.carry_out(task, actions)
+    np.testing.assert_allclose(np.minimum(outcome.level, 1.0), levels, rtol=1e-9)
+    assert outcome.level[0, 1] == 1.0 and len(np.unique(levels[:, 1])) >= 3
+    assert (future.carry_out(task, actions, np.full((6, 2), 2.0)).level[:, 1] > 1.0).any()
+
+
+def test_plans_tell_what_contents_are_worth() -> None:
+    """Where less ore is all that is wanted, contents beside it weigh what they cost: copper bounds the scrap."""
+    network = sorter(low=0.0, high=0.02)
+    solution = improve_plan(bound(network, min_service=1.0))
+    run = simulate_plan(solution)
+    episode = PlannedEpisode("plan", solution.initial, run.stock, run.flow, run.contents)
+    np.testing.assert_allclose(service_levels(network, episode), run.levels[0].T, rtol=1e-12)
+    idle = infer(network, replace(episode, name="idle"))
+    clean = [term.about for term in idle.terms].index("clean")
+    assert idle.distance < 1e-4 and idle.high[clean] > 0.9
+    scrap_alone = simulate_plan(replace(solution, actions=np.tile([-1.0, 0.2], (6, 1))))
+    impure = PlannedEpisode("scrap", solution.initial, scrap_alone.stock, scrap_alone.flow, scrap_alone.contents)
+    assert infer(network, impure).high[clean] < 0.2
 
 
 @pytest.mark.slow

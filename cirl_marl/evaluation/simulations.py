@@ -78,7 +78,7 @@ class Simulation:
         header += [f"mass on {line.id} ({mass})" for line in self.env.dynamics.batches.lines]
         header += [physics.names[row] for row in physics.visible]
         header += [f"mean age of {node.id} ({time})" for node in network.stores if node.lifetime is not None]
-        contents = [f"{part.id} in {id_} (1)" for part in network.substances for id_ in network.compartments]
+        contents = [name for part in network.substances for name in content_columns(network, part.id)]
         return [*header, *disturbance_columns(network), *contents]
 
     def write(self, path: str | Path) -> Path:
@@ -93,6 +93,11 @@ def disturbance_columns(network: Network) -> list[str]:
     """Return headers of the values of disturbances, with their units."""
     processes = network.processes
     return [f"disturbance {n} ({d.unit})" for n, d in zip(processes.names, processes.disturbances, strict=True)]
+
+
+def content_columns(network: Network, substance: str) -> list[str]:
+    """Return the names of the columns of tables that have the content of a substance in nodes and flows."""
+    return [f"{substance} in {id_} (1)" for id_ in network.compartments]
 
 
 def simulate(

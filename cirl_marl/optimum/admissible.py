@@ -78,10 +78,17 @@ class Admissible:
     mixtures: Annotated[Mixtures | None, "scheduled flows of components; None if contents are not followed"]
 
     @classmethod
-    def of(cls, network: Network, agents: Sequence[str] | None = None, like: Mixtures | None = None) -> Admissible:
+    def of(
+        cls,
+        network: Network,
+        agents: Sequence[str] | None = None,
+        like: Mixtures | None = None,
+        present: Floats | None = None,
+    ) -> Admissible:
         """Read the ranges off ``network`` while ``agents`` act and the others are neutral.
 
-        One that is written by components already has the contents of another, which it is ``like``.
+        One that is written by components already has the contents of another, which it is ``like``. Programs may start
+        from stocks of ``present`` contents too; see ``content_ranges``.
 
         Raises:
             NoCertificate: for inner physics, batches, or a solver that is not exact.
@@ -128,7 +135,7 @@ class Admissible:
         base = np.array(coefficients, dtype=float).reshape(-1, steps).T
         mixtures = None
         if isinstance(network, ComponentNetwork):
-            mixtures = _mixtures(lifetimes, setting, valve, base, like)
+            mixtures = _mixtures(lifetimes, setting, valve, base, like, present)
         service_low = [network.interval_means(service.low) for service in network.services]
         return cls(
             network=network,
@@ -280,7 +287,14 @@ def share_ranges(split: Split, wishes: Floats) -> Floats:
     return np.concatenate([low + over * cut, rest[:, None] * split.proportions], axis=1)
 
 
-def _mixtures(lifetimes: Lifetimes, setting: Floats, valve: Floats, base: Floats, like: Mixtures | None) -> Mixtures:
+def _mixtures(
+    lifetimes: Lifetimes,
+    setting: Floats,
+    valve: Floats,
+    base: Floats,
+    like: Mixtures | None,
+    present: Floats | None,
+) -> Mixtures:
     """Return the scheduled flows of components, and give those of each the part of ``setting`` that it can have."""
     network, plan_network = lifetimes.network, lifetimes.plan_network
     # written by components it has the same arcs first, then those within lifetimes, then copies
@@ -293,7 +307,8 @@ def _mixtures(lifetimes: Lifetimes, setting: Floats, valve: Floats, base: Floats
         shares, by_share = np.ones((2, *arcs.shape)), [arc.law is Law.SHARE for arc in whole_arcs]
         shares[0][:, by_share] = setting[0].min(axis=0)[arcs[:, by_share]]
         shares[1][:, by_share] = setting[2].max(axis=0)[arcs[:, by_share]]
-        (content, stocks), grade = content_ranges(network, shares), source_grades(network, network.arcs)
+        content, stocks = content_ranges(network, shares, present)
+        grade = source_grades(network, network.arcs)
     scheduled = np.flatnonzero([LAWS[arc.law].is_scheduled for arc in whole_arcs])
     orders = (setting * valve[:, :, plan_network.donors] * base)[::2][:, :, arcs[0, scheduled]]
     parts = content.transpose(1, 0, 2)[:, :, scheduled]

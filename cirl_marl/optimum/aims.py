@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import field, replace
 from itertools import groupby
-from typing import Annotated
+from typing import Annotated, Protocol
 
 import numpy as np
 from scipy import sparse
@@ -29,6 +29,34 @@ PER_YEAR = "/year"
 RateTables = tuple[Floats, Floats, Floats]
 """What totals have of mean flows, of mean stocks and of distances of controls in some intervals; see ``Ledger.rates``.
 """
+
+
+class EpisodeRecord(Protocol):
+    """What is read off an episode of the simulator, or some intervals of one; see ``Rollout``."""
+
+    @property
+    def levels(self) -> Floats:
+        """Level of each service, shape (B, services, steps)."""
+
+    @property
+    def episode_levels(self) -> Floats:
+        """Mean level of each service, shape (B, services)."""
+
+    @property
+    def stock(self) -> Floats:
+        """Stocks after each interval in the first copy, shape (steps, stores), mass."""
+
+    @property
+    def flow(self) -> Floats:
+        """Mean flows in the first copy, shape (steps, arcs), mass/time."""
+
+    @property
+    def accounts(self) -> Floats:
+        """Amount on each account, discounted, shape (B, accounts)."""
+
+    @property
+    def bookings(self) -> Floats:
+        """Amount on each account, not discounted, shape (B, accounts, steps)."""
 
 
 @positional_record
@@ -79,12 +107,12 @@ class Aims:
         account_sizes = sum(abs(charge * accounts[account]) for account, charge in self.charges.items())
         return self.circularity * network.objective.circularity_scale + float(account_sizes)
 
-    def totals(self, run: Rollout) -> Floats:
+    def totals(self, run: EpisodeRecord) -> Floats:
         """Return what the first episode of a rollout books of each budget, shape (budgets,)."""
         totals: Floats = self.bookings(run)[0]
         return totals
 
-    def bookings(self, run: Rollout) -> Floats:
+    def bookings(self, run: EpisodeRecord) -> Floats:
         """Return what each episode of a rollout books of each budget, shape (episodes, budgets)."""
         return self.amounts(run.accounts, run.bookings)
 
@@ -143,7 +171,7 @@ class Aims:
         pairs = zip(self.budgets, excess.tolist(), strict=True)
         return replace(self, budgets=tuple(replace(budget, most=budget.most - more) for budget, more in pairs))
 
-    def excess(self, run: Rollout) -> Floats:
+    def excess(self, run: EpisodeRecord) -> Floats:
         """Return by how much budgets are exceeded, shape (budgets,)."""
         return np.maximum(self.totals(run) - self.limits, 0.0)
 

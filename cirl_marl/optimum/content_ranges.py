@@ -51,7 +51,7 @@ class Mixtures:
         return np.stack([grade, grade]) if self.has_grade[arc] else self.content[:, :, arc, None]
 
 
-def content_ranges(network: Network, shares: Floats) -> tuple[Floats, Floats]:
+def content_ranges(network: Network, shares: Floats, present: Floats | None = None) -> tuple[Floats, Floats]:
     """Return what part of each flow, and of each stock, each component may be at any time, whatever agents do.
 
     Stocks begin with their content and mix what enters; what a node hands on in shares that differ by component has
@@ -62,6 +62,8 @@ def content_ranges(network: Network, shares: Floats) -> tuple[Floats, Floats]:
         network: whose nodes have the contents.
         shares: least and greatest share of each arc of law ``share``, 1 of others, by component, of any interval, shape
             (2, components, arcs).
+        present: least and greatest part of each component in stocks that programs may start from beside those of the
+            network, shape (2, components, stores); None for none.
 
     Returns:
         Least and greatest part, shapes (2, components, arcs) and (2, components, stores); from 1 to 0 of flows that
@@ -74,6 +76,9 @@ def content_ranges(network: Network, shares: Floats) -> tuple[Floats, Floats]:
     for i, node in enumerate(network.stores):
         parts = contents(network, node, partial(means, edges=content_edges(network, node)))
         ranges[:, :, i] = parts.min(axis=1), parts.max(axis=1)
+    if present is not None:
+        stores = ranges[:, :, : present.shape[2]]
+        stores[...] = np.minimum(stores[0], present[0]), np.maximum(stores[1], present[1])
     for done in range(ROUNDS + len(network.nodes)):
         flows = _handed_on(ranges[:, :, network.donors], shares, is_separate)
         wider = ranges.copy()
@@ -91,6 +96,20 @@ def content_ranges(network: Network, shares: Floats) -> tuple[Floats, Floats]:
     stocks = ranges[:, :, : len(network.stores)].copy()
     stocks[..., [network.node_index[source.id] for source in changing_sources(network)]] = [[[0.0]], [[1.0]]]
     return _handed_on(ranges[:, :, network.donors], shares, is_separate), stocks
+
+
+def present_contents(rows: StateLayout, stock: Floats) -> Floats:
+    """Return the least and the greatest part of each component in stocks of some copies, by stage, shape (rows, B).
+
+    The shape is (2, components, stores); parts are from 1 to 0 where there is nothing.
+    """
+    parts = np.tile([[[1.0]], [[0.0]]], (1, rows.components, len(rows.stages)))
+    for i, stages in rows.stages.items():
+        masses = stock[stages.reshape(rows.components, -1)].reshape(rows.components, -1)
+        whole = masses.sum(axis=0)
+        masses = masses[:, whole > 0] / whole[whole > 0]
+        parts[:, :, i] = masses.min(axis=1, initial=1.0), masses.max(axis=1, initial=0.0)
+    return parts
 
 
 def source_grades(network: Network, arcs: Sequence[Arc]) -> Floats:

@@ -16,6 +16,7 @@ from cirl_marl.network import Floats, Network
 from cirl_marl.network.disturbances import Gaussian
 from cirl_marl.network.uncertainty import draw_network, network_of_intervals
 from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.content_ranges import present_contents
 from cirl_marl.optimum.window_planner import Future
 
 SEED = 38
@@ -74,7 +75,8 @@ class DrawnFutures:
         paths = self._on_grid(paths, intervals)
         path = np.moveaxis(paths, 2, 0).reshape(-1, len(states))
         calendar = np.tile(np.arange(intervals.start, intervals.stop), paths.shape[2])
-        future = self._future(draw_network(network_of_intervals(self._network, calendar), (), path))
+        stock = self._env.physical.stock[:, list(copies)]
+        future = self._future(draw_network(network_of_intervals(self._network, calendar), (), path), stock)
         futures = [future.at(place, step) for place in range(0, len(path), ahead)]
         each = self._count or 1
         return [futures[first : first + each] for first in range(0, len(futures), each)]
@@ -94,8 +96,10 @@ class DrawnFutures:
         dynamics, network = self._env.dynamics, self._env.network
         return network.with_options(episode={"solver_step": dynamics.substep}) if dynamics.substeps > 1 else network
 
-    def _future(self, network: Network) -> Future:
-        admissible = Admissible.of(network, self._env.agents or None)
+    def _future(self, network: Network, stock: Floats) -> Future:
+        """Return a course of the network from some stocks, shape (masses, B)."""
+        present = present_contents(self._env.rows, stock) if network.substances else None
+        admissible = Admissible.of(network, self._env.agents or None, present=present)
         return Future(admissible, self._degree, self._weight, self._reference)
 
     def _on_grid(self, paths: Floats, intervals: range) -> Floats:

@@ -13,19 +13,24 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.dynamics.integrator import Dynamics
-from cirl_marl.network import Floats, Integers
+from cirl_marl.network import Floats
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
+from cirl_marl.optimum.aims import Aims
 from cirl_marl.optimum.bounds import Bound
-from cirl_marl.optimum.linearised import MOST_SLOPES, jacobians, slopes_of, step_program
+from cirl_marl.optimum.linearised import MOST_SLOPES, ActionPlan, Later, jacobians, slopes_of, step_program
 from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.planned_episodes import simulate_plan
 from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.solver import Infeasible, SolverFailure, best_values, solve
+
+P = TypeVar("P", bound=ActionPlan)
 
 TRUST, SMALLEST = 0.25, 1e-5
 """First and smallest half-width of the trust region, in normalised actions: an eighth of their range, and what moves λ̄
@@ -80,12 +85,13 @@ def improve_plan(
         return refine(bound, enough=enough, progress=progress)
     if starts is None:
         starts = CONTENT_STARTS if any(service.substance for service in bound.network.services) else 1
-    plans = []
+    trials = Trials(simulate_plan, lambda run, price: penalised_objective(bound, run, price), demand(bound))
+    plans: list[Bound] = []
     for start in range(starts):
         constant = np.random.default_rng(start).choice([-1.0, 0.0, 1.0], bound.actions.shape[1])
         actions = np.broadcast_to(constant, bound.actions.shape) if start else bound.actions
         report = partial(_tell, progress, start, starts)
-        plans.append(_climb(replace(bound, actions=actions), rounds, enough, report))
+        plans.append(climb(replace(bound, actions=actions), trials, prices(bound), rounds, enough, report))
     if starts == 1:
         return plans[0]
     runs, price = [simulate_plan(plan) for plan in plans], prices(bound)
@@ -98,53 +104,92 @@ def _tell(progress: Callable[[float], None], start: int, starts: int, share: flo
     progress((start + share) / starts)
 
 
-def _climb(bound: Bound, rounds: int, enough: Callable[[Rollout], bool], progress: Callable[[float], None]) -> Bound:
-    """Return ``bound`` with better actions, by linear programs around episodes, from its own."""
-    dynamics = Dynamics(bound.network)
-    price, lack = prices(bound), np.zeros(len(bound.network.services))
-    excess = np.zeros(len(bound.aims.budgets))
-    best, run = bound, simulate_plan(bound)
-    value, trust, slopes = penalised_objective(bound, run, price), TRUST, None
-    contents = np.flatnonzero([bool(service.substance) for service in bound.network.services])
+@positional_record
+class Trials:
+    """How plans of some intervals from the same start are tried, and what is expected of them."""
+
+    simulate: Annotated[Callable[[Any], Any], "plan → its episode in the simulator"]
+    value: Annotated[
+        Callable[[Any, Floats], float], "(episode, prices) → objective reached, less the price of what lacks"
+    ]
+    demand: Annotated[Floats, "mean level of each service, 0 for none, shape (services,)"]
+    first: Annotated[int, "interval of the network in which plans begin"] = 0
+    later: Annotated[Later | None, "what is worth after them; None if nothing comes after"] = None
+
+
+def climb(
+    plan: P,
+    trials: Trials,
+    price: Floats,
+    rounds: int,
+    enough: Callable[[Any], bool] = lambda run: False,
+    progress: Callable[[float], None] = lambda share: None,
+) -> P:
+    """Return a plan with better actions, by linear programs around episodes, from its own.
+
+    Args:
+        plan: with the actions to start from.
+        trials: of plans like it.
+        price: what is charged for a unit that each service lacks, and by which each budget is exceeded.
+        rounds: most linear programs to solve.
+        enough: asked of each episode that is better than those before, whether to stop there.
+        progress: called with the share of rounds that are done.
+    """
+    dynamics, demand, aims, price = Dynamics(plan.network), trials.demand, plan.aims, price.copy()
+    lack, excess = np.zeros(len(demand)), np.zeros(len(aims.budgets))
+    best, run = plan, trials.simulate(plan)
+    value, trust, slopes = trials.value(run, price), TRUST, None
+    contents = np.flatnonzero([bool(service.substance) for service in plan.network.services])
     is_leap = False
     for done in range(rounds):
-        if trust < SMALLEST and _lack_of(contents, bound, run) > TOLERATED_SHORTFALL:
+        if trust < SMALLEST and (demand - run.episode_levels[0])[contents].max(initial=0.0) > TOLERATED_SHORTFALL:
             is_leap = not is_leap
             trust = LEAP
             if not is_leap:
                 price[contents] *= DEARER
-                value, trust = penalised_objective(bound, run, price), TRUST
+                value, trust = trials.value(run, price), TRUST
         if trust < SMALLEST or enough(run):
             break
-        slopes = jacobians(best, dynamics) if slopes is None else slopes
-        wanted, limits = np.minimum(demand(bound) + lack, 1.0), bound.aims.limits - excess
-        program = step_program(best, dynamics, run, wanted, price, trust, slopes, limits=limits, is_leap=is_leap)
+        slopes = jacobians(best, dynamics, trials.first) if slopes is None else slopes
+        wanted, limits = np.minimum(demand + lack, 1.0), aims.limits - excess
+        program = step_program(
+            *(best, dynamics, run, wanted, price, trust, slopes),
+            limits=limits,
+            is_leap=is_leap,
+            first=trials.first,
+            later=trials.later,
+        )
         corrected, gain = program, 0.0
         for _ in range(1 + CORRECTIONS):
             values = best_values(corrected.problem, corrected.scale)
             if values is None:  # a smaller region is another program
                 break
             actions = np.clip(best.actions + values[program.action], -1.0, 1.0)
-            trial = simulate_plan(replace(best, actions=actions))
-            more = penalised_objective(bound, trial, price) - value
+            trial = trials.simulate(_with_actions(best, actions))
+            more = trials.value(trial, price) - value
             if more > gain:
                 better, gain = (actions, trial), more
             elif gain > 0:
                 break
-            if gain > 0 and shortage(bound, trial) <= TOLERATED_SHORTFALL:
+            if gain > 0 and _shortage(demand, aims, trial) <= TOLERATED_SHORTFALL:
                 break
             corrected = program.with_correction(values, run, trial)
         progress((done + 1) / rounds)
         if gain > 0:
-            best, run = replace(best, actions=better[0]), better[1]
-            lack = np.maximum(demand(bound) - run.episode_levels[0], 0.0)  # a step lacks about what the last one did
-            excess = bound.aims.excess(run)
+            best, run = _with_actions(best, better[0]), better[1]
+            lack = np.maximum(demand - run.episode_levels[0], 0.0)  # a step lacks about what the last one did
+            excess = aims.excess(run)
             value, trust, slopes = value + gain, min(1.0, 2 * trust), None
             is_leap = False
         else:
             trust = 0.0 if is_leap else trust / 4
     progress(1.0)
     return best
+
+
+def _with_actions(plan: P, actions: Floats) -> P:
+    result: P = replace(plan, actions=actions)  # type: ignore[type-var]
+    return result
 
 
 def prices(bound: Bound) -> Floats:
@@ -161,11 +206,6 @@ def prices(bound: Bound) -> Floats:
         multipliers = -bound.certificate.under[len(bound.certificate.under) - len(services) :]
         services = np.maximum(multipliers, scale)
     return PENALTY * np.concatenate([services, budgets])
-
-
-def _lack_of(services: Integers, bound: Bound, run: Rollout) -> float:
-    """Return the most that an episode lacks of the levels demanded of some services."""
-    return float((demand(bound) - run.episode_levels[0])[services].max(initial=0.0))
 
 
 def _scale(bound: Bound) -> float:
@@ -186,9 +226,13 @@ def penalised_objective(bound: Bound, run: Rollout, prices: Floats) -> float:
 
 def shortage(bound: Bound, run: Rollout) -> float:
     """Return the most that an episode is short of a demand: of a mean level, or of a budget, relative to that."""
-    excess, limits = bound.aims.excess(run), np.abs(bound.aims.limits)
+    return _shortage(demand(bound), bound.aims, run)
+
+
+def _shortage(demand: Floats, aims: Aims, run: Any) -> float:
+    excess, limits = aims.excess(run), np.abs(aims.limits)
     relative_excess = np.divide(excess, limits, out=np.where(excess > 0, np.inf, 0.0), where=limits > 0)
-    return float(max((demand(bound) - run.episode_levels[0]).max(initial=0.0), relative_excess.max(initial=0.0)))
+    return float(max((demand - run.episode_levels[0]).max(initial=0.0), relative_excess.max(initial=0.0)))
 
 
 def demand(bound: Bound) -> Floats:

@@ -9,22 +9,21 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, Protocol
 
 import numpy as np
 from scipy import sparse
 
-from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.dynamics.ledger import Ledger
 from cirl_marl.dynamics.supply import Supply
 from cirl_marl.environments.actuators import Actuators, planned_deviation
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import positional_record
-from cirl_marl.optimum.aims import Aims, RateTables
-from cirl_marl.optimum.bounds import Bound
+from cirl_marl.optimum.aims import Aims, EpisodeRecord, RateTables, over
+from cirl_marl.optimum.planned_episodes import HasPlan
 from cirl_marl.optimum.program import LinearProgram
-from cirl_marl.optimum.window_simulator import WindowSimulator
+from cirl_marl.optimum.window_simulator import WindowSimulator, service_measures
 
 DIFFERENCE = 1e-6
 """Step of the difference quotients, relative to the scale of a stock or to half the range of a control."""
@@ -34,24 +33,44 @@ MOST_SLOPES = 50_000_000
 """Entries of the largest Jacobians of all intervals that are written, 0.4 GB."""
 
 
-def slopes_of(bound: Bound, dynamics: Dynamics) -> int:
-    """Return how many entries the Jacobians of an episode have."""
-    steps, entries = bound.actions.shape
+def slopes_of(plan: ActionPlan, dynamics: Dynamics) -> int:
+    """Return how many entries the Jacobians of a plan have."""
+    steps, entries = plan.actions.shape
     stocks = dynamics.rows.nodes.stop
-    return int(steps * (stocks + entries) * (stocks + len(bound.network.arcs)))
+    return int(steps * (stocks + entries) * (stocks + len(plan.network.arcs)))
 
 
-def jacobians(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats, Floats]:
-    """Return ∂(x', f̄)/∂x and ∂(x', f̄)/∂a of every interval, and what each ends with, around the bound's actions.
+class ActionPlan(HasPlan, Protocol):
+    """What has actions, of some intervals of an episode: a bound, or the plan of a window."""
+
+    @property
+    def aims(self) -> Aims:
+        """What is weighed, and budgets of accounts."""
+
+    @property
+    def service_weight(self) -> float | None:
+        """W of λ̄/scale + w·service; None if the objective is λ̄."""
+
+
+@positional_record
+class Later:
+    """What comes after some intervals, by what they leave, in the objective of these."""
+
+    cost: Annotated[Floats, "of rows of ``jacobians``, shape (steps, rows)"]
+    level_cost: Annotated[Floats, "of levels, shape (steps, services)"]
+
+
+def jacobians(plan: ActionPlan, dynamics: Dynamics, first: int = 0) -> tuple[Floats, Floats, Floats]:
+    """Return ∂(x', f̄)/∂x and ∂(x', f̄)/∂a of every interval from the first, and what each ends with, around a plan.
 
     Shapes are (steps, rows, stocks), (steps, rows, entries) and (steps, rows); stocks are those of the simulator, by
     stage where there is a lifetime. Rows are stocks x', mean flows f̄ and those of each substance.
     """
-    network = bound.network
-    steps, entries = bound.actions.shape
+    network = plan.network
+    steps, entries = plan.actions.shape
     rows, nodes = dynamics.rows, dynamics.rows.nodes.stop
-    stock = WindowSimulator(bound.network, bound.agents).run(bound.initial, bound.actions)[0]
-    inputs = np.concatenate([stock[:-1], bound.actions], axis=1)
+    stock = WindowSimulator(network, plan.agents).run(plan.initial, plan.actions, first)[0]
+    inputs = np.concatenate([stock[:-1], plan.actions], axis=1)
     scale = np.array([node.scale for node in dynamics.staged_network.stores])
     width = np.concatenate([np.maximum(stock.max(axis=0), scale), np.ones(entries)]) * DIFFERENCE
     # forward in stocks, which may be 0; inward in actions, which may be at a bound
@@ -60,8 +79,8 @@ def jacobians(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats, Floats]
     columns = np.repeat(inputs[:, :, None], nodes + entries + 1, axis=2)
     columns[:, np.arange(nodes + entries), np.arange(nodes + entries)] += shift
     flat = np.ascontiguousarray(columns.transpose(1, 0, 2).reshape(nodes + entries, -1))
-    actuators = Actuators(bound.network, bound.agents or None, flat.shape[1])
-    interval = np.repeat(np.arange(steps), nodes + entries + 1)
+    actuators = Actuators(network, plan.agents or None, flat.shape[1])
+    interval = np.repeat(np.arange(first, first + steps), nodes + entries + 1)
     inner = np.empty((0, flat.shape[1]))
     stocks, supply = dynamics.extend(flat[:nodes]), Supply(dynamics)
     _, done = supply.advance(
@@ -90,7 +109,7 @@ class StepProgram:
     contents: Annotated[list[int], "rows of ``measure`` that are of contents, which it does not read"]
     aims: Annotated[Aims, "whose budgets the last rows of G keep"]
 
-    def with_correction(self, values: Floats, run: Rollout, trial: Rollout) -> StepProgram:
+    def with_correction(self, values: Floats, run: EpisodeRecord, trial: EpisodeRecord) -> StepProgram:
         """Return the program with what an episode was away from what its solution promised: a second-order correction.
 
         Args:
@@ -120,15 +139,18 @@ class _Efforts:
     half: Annotated[Floats, "half the range of each, likewise"]
 
     @classmethod
-    def of(cls, bound: Bound, rates: Floats) -> _Efforts:
-        """Take those that act in a bound; ``rates`` are per distance, shape (accounts, steps, controls)."""
-        network, actions = bound.network, bound.actions
-        acting = Actuators(network, bound.agents or None, len(actions)).control_rows
+    def of(cls, plan: ActionPlan, rates: Floats, first: int) -> _Efforts:
+        """Take those that act in a plan, which begins in interval ``first``.
+
+        ``rates`` are per distance, shape (accounts, steps, controls).
+        """
+        network, actions = plan.network, plan.actions
+        acting = Actuators(network, plan.agents or None, len(actions)).control_rows
         is_charged = np.append(rates.any(axis=(0, 1)), False)  # there are no columns if nothing is charged
         entries = np.flatnonzero(is_charged[np.minimum(acting, len(is_charged) - 1)])
         controls = acting[entries]
-        low, _, high = network.control_bounds[:, controls]
-        away = planned_deviation(network, bound.agents, actions)[controls].T
+        low, _, high = network.control_bounds[:, controls, first : first + len(actions)]
+        away = planned_deviation(network, plan.agents, actions, first)[controls].T
         return cls(entries, controls, away, (high - low).T / 2)
 
     def rows(self, sign: float, action: Integers, effort: Integers, count: int) -> sparse.csr_array:
@@ -144,9 +166,9 @@ class _Efforts:
 
 
 def step_program(
-    bound: Bound,
+    plan: ActionPlan,
     dynamics: Dynamics,
-    run: Rollout,
+    run: EpisodeRecord,
     demand: Floats,
     price: Floats,
     trust: float,
@@ -154,6 +176,8 @@ def step_program(
     margin: Floats | float = 0.0,
     limits: Floats | None = None,
     is_leap: bool = False,
+    first: int = 0,
+    later: Later | None = None,
 ) -> StepProgram:
     """Return the program of the best change of the actions within a trust region, to first order.
 
@@ -161,7 +185,7 @@ def step_program(
     the actions so far. Rows that no step within the region can come to are left out.
 
     Args:
-        bound: whose objective counts, with the actions of the episode.
+        plan: whose objective counts, with the actions of the episode.
         dynamics: of its network.
         run: the episode.
         demand: mean level demanded of each service, shape (services,).
@@ -170,30 +194,34 @@ def step_program(
         slopes: ``jacobians`` of the episode.
         margin: by how much more of a service than its band begins with counts as all of it, relative to that, shape
             (services, steps).
-        limits: budgets of accounts, shape (budgets,); None: those of the bound.
+        limits: budgets of accounts, shape (budgets,); None: those of the plan.
         is_leap: whether what products of contents would be at the levels demanded counts, not at those of the episode:
             what is too impure then gets better as less is made, as it will once nothing is.
+        first: interval of the network in which the plan begins.
+        later: what comes after it.
     """
-    network, limits = bound.network, bound.aims.limits if limits is None else limits
-    steps, entries = bound.actions.shape
+    network, limits = plan.network, plan.aims.limits if limits is None else limits
+    steps, entries = plan.actions.shape
     state, services, is_absolute = slopes[2], len(network.services), network.objective.net_zero == "abs"
-    rates, rates_of_budgets = Ledger(network).rates(), bound.aims.rates(network)
-    efforts = _Efforts.of(bound, rates[2])
+    period = slice(first, first + steps)
+    intervals = range(period.start, period.stop)
+    rates, rates_of_budgets = over(Ledger(network).rates(), intervals), over(plan.aims.rates(network), intervals)
+    efforts = _Efforts.of(plan, rates[2], first)
     size = entries + services + 1 + len(efforts.entries)
     level, imbalance, count = entries, entries + services, size * steps + services + len(limits)
-    step_low, step_high = np.maximum(-trust, -1 - bound.actions), np.minimum(trust, 1 - bound.actions)
+    step_low, step_high = np.maximum(-trust, -1 - plan.actions), np.minimum(trust, 1 - plan.actions)
     furthest = np.maximum(-step_low, step_high)
-    low = np.array([network.interval_means(service.low) for service in network.services]).reshape(services, steps)
+    low = np.array([network.interval_means(service.low)[period] for service in network.services]).reshape(-1, steps)
     low *= 1.0 + margin
-    measure, by_stage, imbalances = _measures(bound, dynamics)
-    contents = _contents(bound, dynamics)
+    measure, by_stage, imbalances = _measures(plan, dynamics)
+    contents = _contents(plan, dynamics)
     accounts = _account_shares(rates, dynamics)
-    weights = -bound.aims.objective(-_circularity_cost(bound, dynamics), accounts)
-    cost, spent = np.zeros(count), np.zeros((len(limits), count))
+    weights = -plan.aims.objective(-_circularity_cost(plan, dynamics), accounts)
+    cost, cost_later, spent = np.zeros(count), np.zeros(count), np.zeros((len(limits), count))
     budgets = _account_shares(rates_of_budgets, dynamics)
     columns = size * np.arange(steps)[:, None] + np.arange(size)
     effort = columns[:, imbalance + 1 :]
-    cost[effort] = -bound.aims.objective(np.zeros(effort.shape), rates[2][:, :, efforts.controls])
+    cost[effort] = -plan.aims.objective(np.zeros(effort.shape), rates[2][:, :, efforts.controls])
     spent[:, effort] = rates_of_budgets[2][:, :, efforts.controls]
     rows: list[sparse.csr_array] = []
     rights: list[Floats] = []
@@ -201,6 +229,8 @@ def step_program(
     for t, response in enumerate(_responses(*slopes[:2])):
         past = columns[: t + 1, :entries].ravel()
         cost[past] += weights[t] @ response
+        if later is not None:
+            cost_later[past] += later.cost[t] @ response
         spent[:, past] += budgets[:, t] @ response
         # low·level − δq ≤ q; −δx ≤ x; and ±(φ + δφ) ≤ imbalance, with q, x and φ those of the simulated episode
         table, limit, own = -by_stage @ response, by_stage @ state[t], np.zeros((len(measure), size))
@@ -208,13 +238,13 @@ def step_program(
         for s, part, whole, least, most in contents:
             share, mass, total = run.levels[0, s, t], float(part @ state[t]), float(whole @ state[t])
             share = max(share, demand[s]) if is_leap else share
-            if math.isfinite(most[t]) and mass >= least[t] * total:
+            if math.isfinite(most[first + t]) and mass >= least[first + t] * total:
                 # level·part ≤ most·whole, to first order: part·level + level₀·δpart − most·δwhole ≤ most·whole
-                table[s] = (share * part - most[t] * whole) @ response
-                limit[s], own[s, level + s] = most[t] * total, mass
+                table[s] = (share * part - most[first + t] * whole) @ response
+                limit[s], own[s, level + s] = most[first + t] * total, mass
             else:  # level·least·whole ≤ part
-                table[s] = (share * least[t] * whole - part) @ response
-                limit[s], own[s, level + s] = mass, least[t] * total
+                table[s] = (share * least[first + t] * whole - part) @ response
+                limit[s], own[s, level + s] = mass, least[first + t] * total
         is_near = abs(table) @ furthest[: t + 1].ravel() > limit - own.sum(axis=1)
         if is_absolute:
             own[-2:, imbalance], is_near[-2:] = -1.0, True
@@ -239,19 +269,22 @@ def step_program(
     bounds[:, level:imbalance, 1] = 1.0
     bounds[:, imbalance + 1 :] = np.stack([-np.abs(efforts.away), efforts.half * furthest[:, efforts.entries]], axis=2)
     lower, upper = np.concatenate([bounds.reshape(-1, 2), np.tile([0.0, np.inf], (services + len(limits), 1))]).T
-    if bound.service_weight is not None:
+    if plan.service_weight is not None:
         cost /= network.objective.circularity_scale
-        cost[columns[:, level:imbalance]] = -bound.service_weight / (steps * max(services, 1))
+        cost[columns[:, level:imbalance]] = -plan.service_weight / (steps * max(services, 1))
     if is_absolute:
-        scale = 1.0 if bound.service_weight is None else network.objective.circularity_scale
-        cost[columns[:, imbalance]] += bound.aims.circularity / (steps * scale)
+        scale = 1.0 if plan.service_weight is None else network.objective.circularity_scale
+        cost[columns[:, imbalance]] += plan.aims.circularity / (steps * scale)
+    if later is not None:
+        cost[columns[:, level:imbalance]] += later.level_cost
+    cost += cost_later
     cost[size * steps :] = price
     problem = LinearProgram(
         cost=cost,
         equal=sparse.csr_array((0, count)),
         equal_to=np.empty(0),
         under=sparse.vstack(rows, format="csr"),
-        under_to=np.concatenate([*rights, -demand, limits - bound.aims.totals(run)]),
+        under_to=np.concatenate([*rights, -demand, limits - plan.aims.totals(run)]),
         low=lower,
         high=upper,
     )
@@ -260,8 +293,8 @@ def step_program(
     unchanged = np.zeros(effort.shape)
     origin = np.concatenate([np.zeros((steps, entries)), run.levels[0].T, net_flow, unchanged], axis=1)
     scales = [np.tile(np.append(np.ones(entries + services), largest), (steps, 1)), np.maximum(efforts.half, TINY)]
-    size_of_excess = np.maximum(np.abs(bound.aims.totals(run)), np.abs(limits))
-    short = [np.maximum(demand - run.levels[0].mean(axis=1), 0.0), np.maximum(bound.aims.totals(run) - limits, 0.0)]
+    size_of_excess = np.maximum(np.abs(plan.aims.totals(run)), np.abs(limits))
+    short = [np.maximum(demand - run.levels[0].mean(axis=1), 0.0), np.maximum(plan.aims.totals(run) - limits, 0.0)]
     return StepProgram(
         problem,
         np.concatenate([np.concatenate(scales, axis=1).ravel(), np.ones(services), size_of_excess]),
@@ -273,7 +306,7 @@ def step_program(
         np.concatenate(measured),
         measure,
         [content[0] for content in contents],
-        bound.aims,
+        plan.aims,
     )
 
 
@@ -287,13 +320,13 @@ def _responses(by_stock: Floats, by_action: Floats) -> Iterator[Floats]:
         stock = response[:nodes]
 
 
-def _measures(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats, Floats]:
+def _measures(plan: ActionPlan, dynamics: Dynamics) -> tuple[Floats, Floats, Floats]:
     """Return what is read off stocks and mean flows, the same of stocks by stage, and −Δ·σ_env of flows.
 
     Read are each service; stocks that scheduled flows leave, as no others could become negative to first order; and
     where |φ| counts, −φ and φ. Shapes are (measures, stores + arcs), (measures, stocks + arcs) and (arcs,).
     """
-    network, stores = bound.network, len(bound.network.stores)
+    network, stores = plan.network, len(plan.network.stores)
     columns = np.eye(stores + len(network.arcs))
     services = [
         columns[[network.node_index[node] for node in service.providers]].sum(axis=0)
@@ -315,33 +348,22 @@ def _measures(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats, Floats]
     return measure, by_stage, imbalances
 
 
-def _contents(bound: Bound, dynamics: Dynamics) -> list[tuple[int, Floats, Floats, Floats, Floats]]:
+def _contents(plan: ActionPlan, dynamics: Dynamics) -> list[tuple[int, Floats, Floats, Floats, Floats]]:
     """Return each service of a content: its number, what reads its substance and its whole, and the ends of its band.
 
     Both read the rows of Jacobians, shape (rows,); the ends have shape (steps,).
     """
-    network, rows, arcs = bound.network, dynamics.rows, len(bound.network.arcs)
-    stocks, contents = rows.nodes.stop, []
-    names = [substance.id for substance in network.substances]
-    for s, service in enumerate(network.services):
-        if not service.substance:
-            continue
-        number = 1 + names.index(service.substance)
-        part, whole = np.zeros((2, stocks + arcs * rows.components))
-        if service.quantity == "stock":
-            for store in (network.node_index[node] for node in service.providers):
-                by_component = rows.stages[store].reshape(rows.components, -1)
-                part[by_component[number]], whole[by_component.ravel()] = 1.0, 1.0
-        else:
-            columns = stocks + network.service_arcs(service)
-            part[columns + number * arcs], whole[columns] = 1.0, 1.0
-        contents.append((s, part, whole, network.interval_means(service.low), network.interval_means(service.high)))
-    return contents
+    network, (part, whole) = plan.network, service_measures(plan.network, dynamics)
+    return [
+        (s, part[s], whole[s], network.interval_means(service.low), network.interval_means(service.high))
+        for s, service in enumerate(network.services)
+        if service.substance
+    ]
 
 
-def _circularity_cost(bound: Bound, dynamics: Dynamics) -> Floats:
+def _circularity_cost(plan: ActionPlan, dynamics: Dynamics) -> Floats:
     """Return minus the share of (x', f̄) of intervals in λ̄, but for an absolute imbalance, (steps, stocks + arcs)."""
-    network, steps = bound.network, len(bound.actions)
+    network, steps = plan.network, len(plan.actions)
     weights = network.circularity_weights
     counted = weights[0] if network.objective.net_zero == "abs" else weights.sum(axis=0)
     of_substances = np.zeros(len(network.arcs) * (dynamics.rows.components - 1))

@@ -32,7 +32,6 @@ from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import CIRCULARITY, is_of_circularity
 from cirl_marl.network.innovations import innovations
-from cirl_marl.network.substances import CONTENT
 from cirl_marl.network.uncertainty import expected_network
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.aims import NO_AIMS, Aim, Aims, aims_of
@@ -40,6 +39,7 @@ from cirl_marl.optimum.draws import Prices
 from cirl_marl.optimum.futures import DrawnFutures
 from cirl_marl.optimum.options import check_margin, check_options, demanded_levels, starting_stocks, with_margin
 from cirl_marl.optimum.solver import Infeasible, SolverFailure
+from cirl_marl.optimum.window_climb import climb_window
 from cirl_marl.optimum.window_planner import Future, WindowPlanner
 from cirl_marl.optimum.windows import EMPTY, Continuation, WindowPlan, WindowTask
 
@@ -203,16 +203,13 @@ class MPC(Planner):
 
         Raises:
             NoCertificate: for a network whose flows are not linear laws; see ``bound``.
-            CirlError: for another number of demanded levels than services, or services or disturbances of contents,
-                which programs of windows do not follow.
+            CirlError: for another number of demanded levels than services.
         """
-        contents = [service.id for service in env.network.services if service.substance]
-        if contents := contents or [path for path in env.network.disturbed if f".{CONTENT}" in path]:
-            fault = f"MPC plans masses, not contents, of which {', '.join(contents)} are"
-            raise CirlError(f"network '{env.network.name}': {fault}; take 'optimum' or a learner")
         network, (horizon, replan, futures) = env.network, self._options
         self._aims = aims = aims_of(network, self._aim, self._at_most)
         self._levels = None if self._min_service is None else demanded_levels(network, self._min_service)
+        has_contents = any(service.substance for service in network.services)
+        self._climbs = has_contents and aims.is_circular and futures is None
         self.note, self._env, is_disturbed = "", env, bool(network.disturbed)
         if self._prices is not None and len(self._prices.service) > len(network.services):
             raise CirlError("prices: those of a bound with budgets, which no plan of one interval can keep")
@@ -374,9 +371,19 @@ class MPC(Planner):
         stock = self._env.physical.stock[self._env.rows.nodes, copy]
         planner = self._planner if is_outlook or self._drawn is None else self._planners[copy]
         plan = self._solve_task(planner, stock, intervals, demands, last, later, is_outlook=is_outlook)
+        if self._climbs and not is_outlook and not len(demands.limits):
+            plan = self._climb(planner, plan, last)
         if is_outlook or self._drawn is not None:
             return plan
         return planner.better_of(plan, np.tile(self._neutral_entries(copy), (len(intervals), 1)))
+
+    def _climb(self, planner: WindowPlanner, plan: WindowPlan, last: WindowPlan | None) -> WindowPlan:
+        """Return a plan in which contents count as they come about, from a plan or what is left of the one before."""
+        if last is not None:
+            ahead = plan.task.intervals.start - last.task.intervals.start
+            places = np.minimum(np.arange(ahead, ahead + len(plan.actions)), len(last.actions) - 1)
+            plan = planner.better_of(plan, last.actions[places])
+        return planner.better_of(plan, climb_window(planner.futures[0], plan.task, plan.actions, self._weight))
 
     def _neutral_entries(self, copy: int) -> Floats:
         """Return neutral actions of a copy, shape (entries,)."""

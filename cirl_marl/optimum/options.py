@@ -125,10 +125,14 @@ def check_margin(margin: float) -> None:
 
 
 def with_margin(network: Network, margin: float) -> Network:
-    """Return a certain network whose services want ``margin`` times as much."""
+    """Return a certain network whose services want ``margin`` times as much, and limits of contents as much less."""
     if margin == 1.0:
         return network
-    services = (replace(s, low=_times(s.low, margin), high=_times(s.high, margin)) for s in network.services)
+    factors = (1.0 / margin if service.substance else margin for service in network.services)
+    services = (
+        replace(s, low=_times(s.low, margin), high=_times(s.high, factor))
+        for s, factor in zip(network.services, factors, strict=True)
+    )
     return replace(network, services=tuple(services))
 
 

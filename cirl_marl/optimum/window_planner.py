@@ -37,6 +37,7 @@ from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
 from cirl_marl.optimum.aims import NO_AIMS, Aims, RateTables, account_rows
 from cirl_marl.optimum.constraints import held_controls
+from cirl_marl.optimum.linearised import Later
 from cirl_marl.optimum.matrices import IntervalCache, Layout, ProgramRows
 from cirl_marl.optimum.program import Program, Programs
 from cirl_marl.optimum.solver import LARGE_PROGRAM, Basis, Infeasible, Solution, SolverFailure, solve
@@ -71,6 +72,20 @@ TOLERANCE = 2e-4
 
 
 @positional_record
+class WindowOutcome:
+    """What the simulator makes of actions of some intervals."""
+
+    level: Annotated[
+        Floats,
+        "of services, more than 1 where there is too much, or of a content with room, shape (intervals, services)",
+    ]
+    bookings: Annotated[Floats, "on budgeted accounts, in parts of budgets, shape (intervals, budgets)"]
+    value: Annotated[float, "objective reached, less what is left to later intervals"]
+    stock: Annotated[Floats, "after each interval, shape (intervals, stores), mass"]
+    flow: Annotated[Floats, "mean of each interval, shape (intervals, arcs), mass/time"]
+
+
+@positional_record
 class WindowTrial:
     """What became of the plan of a window in one future."""
 
@@ -92,6 +107,7 @@ class Future:
         horizon: decisions of an episode, of which the network may have some, or some several times.
         cache: rows of intervals.
         aims: objective and budgets.
+        dynamics: of the network.
     """
 
     def __init__(
@@ -127,7 +143,14 @@ class Future:
             self._programs = Programs(admissible, degree, service_weight, layout=like.layout, cache=self.cache)
         self.layout: Layout = self._programs.layout
         self._simulator = WindowSimulator(network, admissible.agents)
-        self._measure = service_measures(network, self._simulator.dynamics)
+        self.dynamics = self._simulator.dynamics
+        self._measure, self._whole = service_measures(network, self.dynamics)
+        mixtures, self._arcs = admissible.mixtures, len(network.arcs)
+        self._planned_arcs = np.arange(self._arcs) if mixtures is None else mixtures.arcs.ravel()
+        contents = [service for service in network.services if service.substance]
+        self._contents = np.array([network.services.index(service) for service in contents], dtype=np.intp)
+        bands = [[network.interval_means(end) for end in (service.low, service.high)] for service in contents]
+        self._bands = np.array(bands).reshape(-1, 2, network.episode.horizon).transpose(1, 2, 0)
         self._weight = service_weight
         controlled = ~admissible.by_schedule & (admissible.rate[0] < admissible.rate[1]).any(axis=0)
         controlled[admissible.lifetimes.exit_arcs] = False
@@ -139,13 +162,13 @@ class Future:
         future._shift = place - interval
         return future
 
-    def _places(self, intervals: range) -> range:
+    def places(self, intervals: range) -> range:
         """Return intervals of an episode as those of the network."""
         return range(intervals.start + self._shift, intervals.stop + self._shift)
 
     def program(self, task: WindowTask, correction: Correction | None) -> Program:
         """Return the program of a task, corrected by what became of a plan before; its demand is no part of it."""
-        places = self._places(task.intervals)
+        places = self.places(task.intervals)
         admissible, period = self.admissible, slice(places.start, places.stop)
         problem = self._programs.program(task.stock, None, places)
         layout, steps = problem.layout, len(task.intervals)
@@ -169,8 +192,9 @@ class Future:
             rate = np.clip(rate, *admissible.rate[:, period])
             valve = np.clip(valve, *admissible.valve[:, period])
             held_controls(admissible.driver, self._hold, rate, valve, rows)
-            low, under_to, rows_of_levels = problem.low.copy(), problem.under_to.copy(), level_rows(problem)
-            under_to[rows_of_levels] -= (admissible.service_low[period] * error).ravel()
+            low, under_to = problem.low.copy(), problem.under_to.copy()
+            rows_of_levels, numbers, weights = level_rows(problem)
+            under_to[rows_of_levels] -= weights * error.ravel()[numbers]
             low[level_columns(problem)] = -np.maximum(error, 0.0).ravel()
             matrix = rows.matrices()[0]
             equal = sparse.vstack([problem.equal, matrix], format="csr")
@@ -180,7 +204,7 @@ class Future:
 
     def _rates(self, intervals: range, accounts: slice | list[int], counts: Floats) -> RateTables:
         """Return the rates of some accounts, times what amounts of each interval of the episode count."""
-        places, count = self._places(intervals), counts[:, intervals.start : intervals.stop, None]
+        places, count = self.places(intervals), counts[:, intervals.start : intervals.stop, None]
         by_flow, by_stock, by_control = (
             rates[accounts, places.start : places.stop] * count for rates in self._rate_tables
         )
@@ -207,12 +231,13 @@ class Future:
             plan: its variables.
             task: what was planned.
         """
-        intervals, admissible, layout = self._places(task.intervals), self.admissible, problem.layout
+        intervals, admissible, layout = self.places(task.intervals), self.admissible, problem.layout
         variables = plan[: len(intervals) * layout.size].reshape(len(intervals), -1)
         actions = normalised_actions(admissible, layout, variables, task.stock, intervals)
-        level, bookings, value = self.carry_out(task, actions)
-        low = admissible.service_low[intervals.start : intervals.stop]
-        error = np.where(low > 0, np.clip(self._quantity(problem, plan, variables, low) - level, -1.0, 1.0), 0.0)
+        promise, weight = self._promise(problem, plan, variables)
+        outcome = self.carry_out(task, actions, weight)
+        level, bookings = outcome.level, outcome.bookings
+        error = np.where(weight > 0, np.clip(promise - level, -1.0, 1.0), 0.0)
         excess = np.zeros_like(bookings)
         if self._budgets:
             rows_of_totals, beside = self.booking_rows(problem, task)
@@ -221,27 +246,30 @@ class Future:
             excess += np.where(is_counted, more / np.maximum(is_counted.sum(axis=0), 1), 0.0)
         return WindowTrial(
             actions,
-            value,
+            outcome.value,
             np.minimum(level, 1.0).mean(axis=0),
             Correction(error, excess, *self._factors(variables, intervals)),
             bookings,
             variables[:, layout.level : layout.imbalance],
         )
 
-    def carry_out(self, task: WindowTask, actions: Floats) -> tuple[Floats, Floats, float]:
+    def carry_out(self, task: WindowTask, actions: Floats, most: Floats | None = None) -> WindowOutcome:
         """Return what the simulator makes of actions, shape (intervals, entries).
 
-        These are levels of services, more than 1 where there is too much, shape (intervals, services), what is booked
-        on budgeted accounts, in parts of budgets, shape (intervals, budgets), and the objective.
+        Room of contents is in parts of the ``most`` that there is of a substance, shape (intervals, services); without
+        it there is none.
         """
-        intervals = self._places(task.intervals)
-        stocks, flows = self._simulator.run(task.stock, actions, intervals.start)
-        low = self.admissible.service_low[intervals.start : intervals.stop]
-        quantity = np.concatenate([stocks[1:], flows], axis=1) @ self._measure.T
+        intervals = self.places(task.intervals)
+        stocks, flows_of_all = self._simulator.run(task.stock, actions, intervals.start)
+        low, flows = self.admissible.service_low[intervals.start : intervals.stop], flows_of_all[:, : self._arcs]
+        masses = np.concatenate([stocks[1:], flows_of_all], axis=1)
+        quantity = masses @ self._measure.T
         level = np.divide(quantity, low, out=np.ones_like(low), where=low > 0)
+        if len(self._contents):
+            level[:, self._contents] = self._content_levels(quantity, masses @ self._whole.T, intervals, most)
         bookings, accounts = np.zeros((len(intervals), len(self._budgets))), np.zeros((0, len(intervals)))
         if self._ledger is not None:  # whose copies are the intervals here
-            stores = self._simulator.dynamics.rows.stocks(np.append(stocks, np.ones((len(stocks), 1)), axis=1).T)
+            stores = self.dynamics.rows.stocks(np.append(stocks, np.ones((len(stocks), 1)), axis=1).T)
             deviation, agents = None, self.admissible.agents
             if self._ledger.has_efforts:
                 deviation = planned_deviation(self.network, agents, actions, intervals.start)
@@ -251,10 +279,24 @@ class Future:
             amounts, period = self._ledger.sums(entries), slice(task.intervals.start, task.intervals.stop)
             accounts = amounts * self._discount[:, period]
             bookings = (amounts[self._budgets] * self._counts[:, period] / self.aims.sizes[:, None]).T
-        value = self._value(task, flows, stocks[-1], np.minimum(level, 1.0), accounts.sum(axis=1))
+        value = self._value(task, flows_of_all, stocks[-1], np.minimum(level, 1.0), accounts.sum(axis=1))
         if len(task.charges):
             value -= float(task.charges @ bookings.sum(axis=0))
-        return level, bookings, value
+        return WindowOutcome(level, bookings, value, self.dynamics.rows.stocks(stocks[1:].T).T, flows)
+
+    def _content_levels(self, part: Floats, whole: Floats, intervals: range, most: Floats | None) -> Floats:
+        """Return the levels of contents, shape (intervals, contents), of masses, shape (intervals, services)."""
+        part, whole = part[:, self._contents], whole[:, self._contents]
+        low, high = (ends[intervals.start : intervals.stop] for ends in self._bands)
+        finite = np.isfinite(high)
+        excess = np.maximum(low * whole - part, np.where(finite, part - np.where(finite, high, 0.0) * whole, -np.inf))
+        # min(1, content/low, high/content) by what is too little, or too much
+        size = np.where(part < low * whole, low * whole, part)
+        level: Floats = 1.0 - np.divide(np.maximum(excess, 0.0), size, out=np.zeros_like(size), where=size > 0)
+        if most is not None:
+            most = most[:, self._contents]
+            level -= np.divide(np.minimum(excess, 0.0), most, out=np.zeros_like(most), where=most > 0)
+        return level
 
     def _factors(self, variables: Floats, intervals: range) -> tuple[Floats, Floats]:
         """Return the rates and valves of a plan, the neutral ones where nothing flows; see ``Correction``."""
@@ -270,17 +312,24 @@ class Future:
         )
         return np.clip(rate, *admissible.rate[:, period]), np.clip(valve, *admissible.valve[:, period])
 
-    def _quantity(self, problem: Program, plan: Floats, variables: Floats, low: Floats) -> Floats:
-        """Return q̂/l of a plan, shape (intervals, services)."""
+    def _promise(self, problem: Program, plan: Floats, variables: Floats) -> tuple[Floats, Floats]:
+        """Return q̂/l of a plan and l, of contents 1 − e/m with the excess e and m, shape (intervals, services)."""
         layout = problem.layout
         levels = variables[:, layout.level : layout.imbalance]
-        activity = (problem.under[level_rows(problem)] @ plan).reshape(low.shape)  # l·level − q̂
-        quantity: Floats = low * levels - activity
-        return np.divide(quantity, low, out=np.zeros_like(low), where=low > 0)
+        rows, numbers, weights = level_rows(problem)
+        # l·level − q̂, of contents m·level + e
+        activity = problem.under[rows] @ plan
+        ahead, most = np.full(levels.size, np.inf), np.zeros(levels.size)
+        np.minimum.at(ahead, numbers, (weights * levels.ravel()[numbers] - activity) / weights)
+        np.maximum.at(most, numbers, weights)
+        promise = np.where(most > 0, ahead, 0.0).reshape(levels.shape)
+        promise[:, self._contents] += 1.0
+        return promise, most.reshape(levels.shape)
 
-    def _value(self, task: WindowTask, flows: Floats, end: Floats, levels: Floats, accounts: Floats) -> float:
+    def _value(self, task: WindowTask, flows_of_all: Floats, end: Floats, levels: Floats, accounts: Floats) -> float:
         """Return the objective that the simulator reaches, in parts of that of the episode."""
-        network, share = self.network, len(flows) / self.horizon
+        network, share = self.network, len(flows_of_all) / self.horizon
+        flows = flows_of_all[:, : self._arcs]
         weights = network.circularity_weights
         per_interval = flows @ weights.sum(axis=0)
         if network.objective.net_zero == "abs":
@@ -290,15 +339,32 @@ class Future:
             value = value / network.objective.circularity_scale
             value += self._weight * share * float(levels.mean()) if levels.size else 0.0
         if task.later is not None:
-            value -= self._later_cost(task.later, flows, self.admissible.lifetimes.start_planned @ end)
+            value -= self._later_cost(task.later, flows_of_all, self.admissible.lifetimes.start_planned @ end)
             if not task.is_redrawn:  # else all that lacks has its price
                 value -= float(np.sum(task.later.costs[:, self.layout.level : self.layout.imbalance] * levels))
         return value
 
+    def later(self, task: WindowTask) -> Later | None:
+        """Return what a task charges for what is left to later intervals, but for its distance from their plan."""
+        if task.later is None:
+            return None
+        layout, costs, nodes = self.layout, task.later.costs, self.dynamics.rows.nodes.stop
+        arcs = self._planned_arcs
+        by_flow = np.sum([costs[:, first + arcs] for first in layout.flow.tolist()], axis=0)
+        # of a whole flow what is no substance, and beside it by how much each substance differs
+        by_flow[:, self._arcs :] -= np.tile(by_flow[:, : self._arcs], len(arcs) // self._arcs - 1)
+        cost = np.zeros((len(costs), nodes + self._arcs * self.dynamics.rows.components))
+        cost[:, nodes : nodes + len(arcs)] = by_flow
+        cost[-1, :nodes] = costs[-1, layout.last] @ self.admissible.lifetimes.start_planned
+        return Later(cost, costs[:, layout.level : layout.imbalance] * (not task.is_redrawn))
+
     def _later_cost(self, later: Continuation, flows: Floats, end: Floats) -> float:
         """Return what an episode of the simulator leaves to later intervals, by its last stocks and its mean flows."""
-        layout, arcs = self.layout, flows.shape[1]
-        by_flow = sum(later.costs[:, first : first + arcs] for first in layout.flow.tolist())
+        layout, arcs = self.layout, self._planned_arcs
+        flows = flows[:, : len(arcs)].copy()
+        for first in range(self._arcs, len(arcs), self._arcs):  # of what is no substance, then of each
+            flows[:, : self._arcs] -= flows[:, first : first + self._arcs]
+        by_flow = sum(later.costs[:, first + arcs] for first in layout.flow.tolist())
         price = later.costs[-1, layout.last]
         distance = DISTANCE * np.abs(price) @ np.abs(end - later.stocks)
         return float(price @ end + distance + np.sum(by_flow * flows))
@@ -405,9 +471,9 @@ class WindowPlanner:
 
     def better_of(self, plan: WindowPlan, actions: Floats) -> WindowPlan:
         """Return a plan, or in its place other actions of its intervals if they do better at the same prices."""
-        level, bookings, value = self.futures[0].carry_out(plan.task, actions)
-        level = np.minimum(level, 1.0).mean(axis=0)
-        other = replace(plan, actions=actions, level=level, bookings=bookings, value=value)
+        outcome = self.futures[0].carry_out(plan.task, actions)
+        level = np.minimum(outcome.level, 1.0).mean(axis=0)
+        other = replace(plan, actions=actions, level=level, bookings=outcome.bookings, value=outcome.value)
         merit = self._merit(other, plan.task.price)
         return replace(other, merit=merit) if merit > self._merit(plan, plan.task.price) else plan
 

@@ -32,7 +32,8 @@ class WindowSimulator:
             first: interval of the episode that they begin in.
 
         Returns:
-            Stocks, shape (intervals + 1, rows), mass, and flows, shape (intervals, arcs), mass/time.
+            Stocks, shape (intervals + 1, rows), mass, and flows, of all and then of each substance, shape (intervals,
+            components · arcs), mass/time.
         """
         dynamics, inner = self.dynamics, np.empty((0, 1))
         masses, stocks, flows = dynamics.extend(stock[:, None]), [stock], []
@@ -42,18 +43,29 @@ class WindowSimulator:
             done = self._supply.advance(masses, inner, controls, interval, self._idle)[1]
             masses = done.stock
             stocks.append(masses[dynamics.rows.nodes, 0])
-            flows.append(done.moved_mass[:, 0] / dynamics.network.episode.control_interval)
+            mass = np.concatenate([done.moved_mass[:, 0], done.moved_substances[:, 0]])
+            flows.append(mass / dynamics.network.episode.control_interval)
         return np.array(stocks), np.array(flows)
 
 
-def service_measures(network: Network, dynamics: Dynamics) -> Floats:
-    """Return what each service reads off stocks and mean flows, shape (services, stocks + arcs)."""
-    nodes = dynamics.rows.nodes.stop
-    measure = np.zeros((len(network.services), nodes + len(network.arcs)))
+def service_measures(network: Network, dynamics: Dynamics) -> tuple[Floats, Floats]:
+    """Return what each service measures, of a content the mass of its substance, and of a content the whole mass.
+
+    Both read stocks by stage, mean flows and those of each substance, shape (services, stocks + components · arcs); a
+    service that is no content has no whole.
+    """
+    rows, arcs, names = dynamics.rows, len(network.arcs), ["", *(substance.id for substance in network.substances)]
+    part, whole = np.zeros((2, len(network.services), rows.nodes.stop + rows.components * arcs))
     for s, service in enumerate(network.services):
+        number = names.index(service.substance)
         if service.quantity == "stock":
             for place in (network.node_index[node] for node in service.providers):
-                measure[s, dynamics.rows.stages.get(place, place)] = 1.0
+                stages = rows.stages.get(place, np.array([place]))
+                part[s, stages.reshape(rows.components, -1)[number] if number else stages] = 1.0
+                whole[s, stages] = 1.0
         else:
-            measure[s, nodes + network.service_arcs(service)] = 1.0
-    return measure
+            columns = rows.nodes.stop + network.service_arcs(service)
+            part[s, columns + number * arcs] = whole[s, columns] = 1.0
+        if not number:
+            whole[s] = 0.0
+    return part, whole

@@ -150,12 +150,15 @@ def level_columns(problem: Program) -> Integers:
     return columns
 
 
-def level_rows(problem: Program) -> Integers:
-    """Return the row of G that holds each level, shape (intervals · services,)."""
+def level_rows(problem: Program) -> tuple[Integers, Integers, Floats]:
+    """Return the rows of G that hold levels, where nothing is demanded: which, of which level, and with what weight.
+
+    Levels are numbered as in ``level_columns``; shapes are (rows,).
+    """
     matrix = problem.under.tocsc()[:, level_columns(problem)]
     matrix.sort_indices()
-    rows: Integers = matrix.indices[matrix.indptr[:-1]]  # that of the demand comes last
-    return rows
+    places, holds = np.repeat(np.arange(matrix.shape[1]), np.diff(matrix.indptr)), matrix.data > 0
+    return matrix.indices[holds], places[holds], matrix.data[holds]
 
 
 def with_distance(problem: Program, later: Continuation) -> Program:

@@ -159,9 +159,6 @@ def infer(
     whole_number("episodes", episodes, 1)
     stop = time.process_time() + seconds
     network = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
-    if contents := [service.id for service in network.services if service.substance]:
-        fault = f"programs are of masses, not of contents, of which {', '.join(contents)} are"
-        raise CirlError(f"network '{network.name}': infer: {fault}")
     sources = [plans] if isinstance(plans, str | Path | PlannedEpisode) else list(plans)
     if not sources:
         raise CirlError("infer: no plans were given")

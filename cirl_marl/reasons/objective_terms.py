@@ -18,6 +18,7 @@ from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Arc, Node, Role
+from cirl_marl.network.rowsum import NEGLIGIBLE
 from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.vintages import Lifetimes
 
@@ -39,6 +40,9 @@ class PlannedEpisode:
     initial: Annotated[Floats, "stocks at the start as the simulator has them, mass"]
     stock: Annotated[Floats, "at the end of each interval, shape (steps, stores), mass"]
     flow: Annotated[Floats, "means over the intervals, shape (steps, arcs), mass/time"]
+    contents: Annotated[
+        Floats, "of each substance in nodes at those ends, then in flows, shape (steps, substances, compartments)"
+    ] = field(default_factory=lambda: np.zeros((0, 0, 0)))
 
 
 @positional_record
@@ -129,7 +133,7 @@ def objective_terms(network: Network, kinds: Sequence[str] = KINDS) -> list[Obje
     """Return what a plan of a network may be meant to do.
 
     - *circularity*: each part of λ, −Δ times what it counts, mass: taken from reservoirs, put into landfills, …
-    - *services*: the mean level of each service; of its band the lower end.
+    - *services*: the mean level of each service; of its band the lower end, unless it is of a content.
     - *set-points*: −((q − set-point)/scale)² of each compartment that has one, as in its local reward.
 
     Raises:
@@ -173,13 +177,26 @@ def circularity_part(network: Network, arc: int) -> str:
 
 
 def service_levels(network: Network, episode: PlannedEpisode) -> Floats:
-    """Return the level min(1, q/low) of each service in each interval, shape (steps, services)."""
-    levels = np.ones((len(episode.flow), len(network.services)))
+    """Return the level of each service in each interval, shape (steps, services).
+
+    It is min(1, q/low), of a content min(1, q/low, high/q).
+    """
+    levels, names = np.ones((len(episode.flow), len(network.services))), [part.id for part in network.substances]
     for s, service in enumerate(network.services):
         low = network.interval_means(service.low)
         if service.quantity == "stock":
-            quantity = episode.stock[:, [network.node_index[node] for node in service.providers]].sum(axis=1)
+            places = np.array([network.node_index[node] for node in service.providers])
+            masses, first = episode.stock[:, places], 0
         else:
-            quantity = episode.flow[:, network.service_arcs(service)].sum(axis=1)
-        levels[:, s] = np.minimum(1.0, np.divide(quantity, low, out=np.ones_like(quantity), where=low > 0))
+            places = np.array(network.service_arcs(service))
+            masses, first = episode.flow[:, places], len(network.nodes)
+        quantity, is_some = masses.sum(axis=1), np.ones(len(masses), dtype=bool)
+        if service.substance:
+            part = (masses * episode.contents[:, names.index(service.substance), first + places]).sum(axis=1)
+            is_some = quantity > NEGLIGIBLE
+            quantity = np.divide(part, quantity, out=np.zeros_like(part), where=is_some)
+            high = network.interval_means(service.high)
+            levels[:, s] = np.divide(high, quantity, out=np.ones_like(part), where=quantity > high)
+        enough = np.divide(quantity, low, out=np.ones_like(quantity), where=(low > 0) & is_some)
+        levels[:, s] = np.minimum(levels[:, s], enough)
     return levels

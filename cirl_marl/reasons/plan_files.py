@@ -18,6 +18,7 @@ from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RunError, unknown_name
+from cirl_marl.evaluation.simulations import content_columns
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum.options import by_stage
@@ -130,7 +131,11 @@ def _simulated_episode(network: Network, table: _Table) -> PlannedEpisode:
     stock = np.array([table.column(name) for name in stocks]).T
     flow = np.array([table.column(name, 1) for name in flows]).T
     initial = by_stage(network, StateLayout(simulated_network(network)), stock[0])
-    return PlannedEpisode(str(table.path), initial, stock[1:], flow)
+    contents = [
+        [table.column(name, 1) for name in content_columns(network, substance.id)] for substance in network.substances
+    ]
+    shape = (len(network.substances), len(network.compartments), len(flow))
+    return PlannedEpisode(str(table.path), initial, stock[1:], flow, np.moveaxis(np.reshape(contents, shape), 2, 0))
 
 
 class _TableController(Controller):
@@ -164,7 +169,7 @@ def _carry_out(network: Network, table: _Table, seed: int | None) -> PlannedEpis
             f"{table.path}: carried out from {start.description} its mean circularity is {circularity.mean():.6g} "
             f"{mass}, but the file says {on_file.mean():.6g}: it is of another start (--seed), scenario or definition"
         )
-    return PlannedEpisode(str(table.path), initial, episode.stock, episode.flow)
+    return PlannedEpisode(str(table.path), initial, episode.stock, episode.flow, episode.contents)
 
 
 def _stocks(env: MultiAgentVectorEnv) -> Floats:
@@ -179,5 +184,6 @@ def _episodes_of_run(run: RunDirectory, seed: int, count: int) -> list[PlannedEp
     for episode in range(count):
         env.reset(seed=seed + episode)
         initial, outcome = _stocks(env), rollout(env, policies, seed=seed + episode)
-        episodes.append(PlannedEpisode(f"{run.path}, episode {episode + 1}", initial, outcome.stock, outcome.flow))
+        name, parts = f"{run.path}, episode {episode + 1}", (outcome.stock, outcome.flow, outcome.contents)
+        episodes.append(PlannedEpisode(name, initial, *parts))
     return episodes

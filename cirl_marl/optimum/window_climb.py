@@ -1,0 +1,85 @@
+"""Better actions for the plan of a window in which contents count, by linear programs around what comes of them.
+
+The program of a window lets what is no substance and each substance go separate ways within the ranges of contents, so
+that its plan may be far too impure. It is where ``climb`` begins, as it does with the plan of a bound.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Annotated
+
+import numpy as np
+
+from cirl_marl.network import Floats, Network
+from cirl_marl.network.declarations import positional_record
+from cirl_marl.optimum.aims import NO_AIMS, Aims
+from cirl_marl.optimum.improve import Trials, climb
+from cirl_marl.optimum.linearised import MOST_SLOPES, slopes_of
+from cirl_marl.optimum.window_planner import Future
+from cirl_marl.optimum.windows import WindowTask
+
+ROUNDS = 20
+"""Most linear programs for a window."""
+
+
+@positional_record
+class WindowActions:
+    """Actions of some intervals, as ``climb`` improves them."""
+
+    network: Annotated[Network, "the network"]
+    agents: Annotated[tuple[str, ...], "who acts"]
+    initial: Annotated[Floats, "stocks at the start, by stage, shape (rows,), mass"]
+    actions: Annotated[Floats, "normalised, shape (intervals, entries)"]
+    service_weight: Annotated[float | None, "of λ̄/scale + w·service"]
+    aims: Annotated[Aims, "λ̄ alone"] = NO_AIMS
+
+
+@positional_record
+class WindowEpisode:
+    """What came of them; see ``EpisodeRecord``."""
+
+    value: Annotated[float, "objective reached, less what is left to later intervals"]
+    levels: Annotated[Floats, "shape (1, services, intervals)"]
+    stock: Annotated[Floats, "shape (intervals, stores), mass"]
+    flow: Annotated[Floats, "shape (intervals, arcs), mass/time"]
+    accounts: Annotated[Floats, "none, as no account counts"]
+    bookings: Annotated[Floats, "likewise"]
+
+    @property
+    def episode_levels(self) -> Floats:
+        """Mean level of each service, shape (1, services)."""
+        return np.asarray(self.levels.mean(axis=2))
+
+
+def climb_window(future: Future, task: WindowTask, actions: Floats, service_weight: float | None) -> Floats:
+    """Return better actions of a window, shape (intervals, entries).
+
+    Args:
+        future: that is planned for, in which no account counts.
+        task: what is planned.
+        actions: to begin with.
+        service_weight: of the objective; None if services are demanded.
+    """
+    share, no_accounts = len(task.intervals) / future.horizon, np.zeros((1, 0))
+    plan = WindowActions(future.network, future.admissible.agents, task.stock, actions, service_weight)
+    if slopes_of(plan, future.dynamics) > MOST_SLOPES:
+        return actions
+
+    def simulate(trial: WindowActions) -> WindowEpisode:
+        outcome = future.carry_out(task, trial.actions)
+        levels = np.minimum(outcome.level, 1.0).T[None]
+        return WindowEpisode(
+            outcome.value / share, levels, outcome.stock, outcome.flow, no_accounts, no_accounts[..., None]
+        )
+
+    def value(run: WindowEpisode, price: Floats) -> float:
+        return run.value - float(price @ np.maximum(0.0, demand - run.episode_levels[0]))
+
+    demand = np.zeros(len(future.network.services)) if task.demand is None else task.demand
+    later = future.later(task)
+    if later is not None:
+        later = replace(later, cost=later.cost / share, level_cost=later.level_cost / share)
+    trials = Trials(simulate, value, demand, future.places(task.intervals).start, later)
+    price = task.price if len(task.price) else np.zeros(len(demand))
+    return climb(plan, trials, price, ROUNDS).actions
