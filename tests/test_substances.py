@@ -22,6 +22,7 @@ from cirl_marl import (
     CirlError,
     Control,
     ControlKind,
+    DefinitionError,
     Episode,
     Law,
     Network,
@@ -38,6 +39,7 @@ from cirl_marl import (
     simulate,
     simulate_plan,
 )
+from cirl_marl.controllers.lint import lint_warnings
 from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
 from cirl_marl.definitions.writer import definition_of
 from cirl_marl.dynamics.integrator import Dynamics
@@ -51,9 +53,11 @@ from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.draw_proofs import Sampling
 from cirl_marl.optimum.linearised import jacobians, step_program
 from cirl_marl.optimum.options import by_stage, with_margin
-from cirl_marl.optimum.program import LARGE
+from cirl_marl.optimum.program import LARGE, Programs
+from cirl_marl.optimum.solver import solve
 from cirl_marl.optimum.window_planner import Future
-from cirl_marl.optimum.windows import WindowTask
+from cirl_marl.optimum.window_simulator import WindowSimulator
+from cirl_marl.optimum.windows import Continuation, WindowTask
 from cirl_marl.reasons.inverse import infer
 from cirl_marl.reasons.objective_terms import PlannedEpisode, service_levels
 from cirl_marl.reasons.prices import shadow_prices
@@ -66,6 +70,7 @@ substances_networks = st.builds(
     st.booleans(),
 )
 COPPER = (Substance(id="copper", scale=0.01),)
+TIN = Substance(id="tin")
 
 
 def rollout_of(network: Network, copies: int, seed: int) -> tuple[MultiAgentVectorEnv, list[np.ndarray]]:
@@ -834,7 +839,7 @@ def test_mpc_keeps_contents(horizon: int | None, worst: float) -> None:
 def sorter(limit: float = 0.02, **service: Any) -> Network:
     """Return ore without copper and scrap with 4 % of it that make one product."""
     order = Control(kind=ControlKind.FLOW, low=0.0, neutral=2.0, high=10.0)
-    place: dict[str, Any] = {"provider": "made", "quantity": "flow"}
+    place: dict[str, Any] = {"provider": "made", "quantity": "flow", "low": 0.001}
     return Network(
         name="sorter",
         nodes=(
@@ -1006,3 +1011,159 @@ def test_corrections_of_steps_leave_contents_out() -> None:
     change = corrected.problem.under_to[: len(rows)] - program.problem.under_to[: len(rows)]
     assert (change[rows == 1] == 0).all() and (change[rows == 0] != 0).all()
     assert (rows == 1).any() and (rows == 0).any()
+
+
+LIMIT = Service(id="clean", provider="use", quantity="stock", substance="copper", high=0.9, low=0.0)
+
+
+def pot(*arcs: Arc, copper: float = 0.5, services: tuple[Service, ...] = (LIMIT,), **options: Any) -> Network:
+    """Return 20 t with some copper that get 4 t of copper a year, ore beside it, and what is poured of either."""
+    return Network(
+        name="pot",
+        nodes=(
+            Node(id="ore", role=Role.NONRENEWABLE_RESERVOIR, initial=(100.0, 100.0)),
+            Node(id="wires", initial=(100.0, 100.0), content={"copper": 1.0}),
+            Node(id="pot", initial=(20.0, 20.0), content={"copper": copper}),
+            Node(id="use", initial=(0.0, 0.0)),
+        ),
+        arcs=(Arc(id="wired", donor="wires", recipient="pot", law=Law.EXOGENOUS, flow=4.0), *arcs),
+        services=services,
+        substances=COPPER,
+        mass_unit="t",
+        time_unit="year",
+        episode=Episode(control_interval=1.0, horizon=1, **options),
+    )
+
+
+@pytest.mark.parametrize(("merge", "rise"), [(False, 0.28525), (True, (6 * 0.28525 + 2 * 0.095) / 16)])
+def test_programs_let_contents_change_within_an_interval(merge: bool, rise: float) -> None:
+    """Of 4 t a year four substeps carry 2, 2.1, 2.195 and 2.28525 t of copper; merged they have two moments."""
+    network = pot(Arc(id="poured", donor="pot", recipient="use", law=Law.EXOGENOUS, flow=4.0), solver_step=0.25)
+    programs = Programs(Admissible.of(network), 1, None, merge_pieces=merge)
+    problem = programs.program(by_stage(network, Dynamics(network).rows, network.initial[0]))
+    flow = programs.layout.flow + programs.admissible.network.arc_index["poured:copper"]
+    cost = np.zeros(len(problem.cost))
+    cost[flow[[0, -1]]] = 1.0, -1.0
+    assert programs.layout.pieces == (1 if merge else 4)
+    assert solve(replace(problem, cost=cost), label="the rise").plan @ -cost >= rise - 1e-9
+
+
+def test_supplies_of_varying_content_are_shared_by_weight() -> None:
+    """Of two idle supplies one carries more and more copper; of all else the other supplies as much as it does."""
+    order = Control(kind=ControlKind.FLOW, low=0.0, neutral=0.0, high=6.0)
+    arcs = [
+        Arc(
+            id=f"from_{donor}",
+            donor=donor,
+            recipient="use",
+            law=Law.CONTROLLED,
+            control=order,
+            makes_up_for="made",
+            weight=0.5,
+        )
+        for donor in ("ore", "pot")
+    ]
+    made = Service(id="made", provider="from_ore", also=("from_pot",), quantity="flow", low=4.0)
+    valve = Control(kind=ControlKind.RATE, low=0.0, neutral=0.1, high=1.0)
+    away = Arc(id="thrown", donor="use", recipient="wires", law=Law.DONOR, rate=1.0, control=valve)
+    network = replace(pot(*arcs, away, copper=0.0, services=(made, LIMIT)), default_agents=("thrown",))
+    solution = bound(network, min_service=[1.0, 0.0])
+    run = simulate_plan(solution)
+    np.testing.assert_allclose(run.flow[0, 1:3], 2.0, rtol=1e-6)
+    assert run.episode_circularity[0] <= solution.objective + 1e-9
+
+
+def test_a_content_above_all_there_is_is_one_fault() -> None:
+    """And of a sum where no single one is."""
+    for parts, fault in (
+        ({"copper": 1.4}, "content.copper 1.4 must lie in [0, 1]"),
+        ({"copper": 0.7, "tin": 0.6}, "sum to 1.3"),
+    ):
+        with pytest.raises(NetworkError) as error:
+            replace(sorter(), nodes=(Node(id="ore", content=parts), *sorter().nodes[1:]), substances=(*COPPER, TIN))
+        assert fault in str(error.value)
+        assert len([line for line in error.value.problems if "ore" in line]) == 1
+
+
+@pytest.mark.parametrize("band", [{"low": 0.0, "high": 1.5}, {"low": 2.0, "high": 3.0}])
+def test_limits_of_contents_are_at_most_one(band: dict[str, float]) -> None:
+    """A limit of 1.5 was meant in percent."""
+    with pytest.raises(NetworkError, match=r"service 'clean': substance: .* is more than 1, all there is"):
+        sorter(**band)
+
+
+@pytest.mark.parametrize(
+    ("band", "remark"),
+    [
+        ({"low": 0.0, "high": 0.02}, ""),
+        ({"low": 0.01, "high": 0.02}, ""),
+        ({"low": 0.05}, "no stock has more than 0.04 of it, less than the 0.05 that it asks for"),
+    ],
+)
+def test_contents_that_no_mixture_has_are_told(band: dict[str, float], remark: str) -> None:
+    """Between the poorest and the richest stock everything can be mixed; a node that separates can do more."""
+    remarks = [text for text in lint_warnings(sorter(**band)) if "separates" in text]
+    assert (remark in "".join(remarks)) and bool(remark) == bool(remarks)
+    rich = sorter(low=0.0, high=0.02)
+    nodes = tuple(replace(node, content={"copper": 0.03}) if node.stores else node for node in rich.nodes)
+    assert [text for text in lint_warnings(replace(rich, nodes=nodes)) if "less than 0.03 of it, more" in text]
+    arcs = [replace(arc, share=0.1, transfer={"copper": 0.9}) if arc.id == "left" else arc for arc in rich.arcs]
+    arcs.append(Arc(id="kept", donor="use", recipient="scrap", law=Law.SHARE))
+    separating = replace(rich, nodes=nodes, arcs=tuple(arcs))
+    assert not [text for text in lint_warnings(separating) if "separates" in text]
+
+
+def test_uncertain_contents_are_of_substances_that_are_stated() -> None:
+    """The nearest name is told."""
+    spread = Spread(low=0.5, high=1.5, distribution="uniform")
+    for path, fault in (
+        ("coper", "content: unknown substance 'coper'. Did you mean 'copper'"),
+        ("tin", "is not stated"),
+    ):
+        with pytest.raises(NetworkError, match=fault):
+            replace(sorter(), substances=(*COPPER, TIN), uncertain={f"nodes.scrap.content.{path}": spread})
+
+
+def test_an_unknown_distribution_is_one_fault(tmp_path: Path) -> None:
+    """What would be wrong with the nearest one is not told as well."""
+    text = EXAMPLE.read_text()
+    before = 'content.copper = { value = 0.4, unit = "%"'
+    path = tmp_path / "steel.toml"
+    path.write_text(text.replace(before, f'{before}, range = [0.2, 0.6], distribution = "norml"'))
+    with pytest.raises(DefinitionError) as error:
+        load_network(path)
+    assert str(error.value).count("\n") == 0 and "unknown value 'norml'. Did you mean 'normal'?" in str(error.value)
+
+
+def test_what_comes_after_a_window_prices_each_component() -> None:
+    """At random prices of flows and stocks a plan is charged for each by itself, and to first order by the same."""
+    network = sorter(low=0.01, high=0.02)
+    future, random = Future(Admissible.of(network), 2, None), np.random.default_rng(0)
+    rows, layout, mixtures = future.dynamics.rows, future.layout, future.admissible.mixtures
+    assert mixtures is not None
+    start, actions = by_stage(network, rows, network.initial[0]), random.uniform(-0.5, 1.0, (2, 2))
+    stocks, flows = WindowSimulator(network, ()).run(start, actions)
+    copper = flows[:, 4:]
+    costs, prices = np.zeros((2, layout.size)), random.uniform(1.0, 2.0, (2, 4))
+    for component, flow in enumerate((flows[:, :4] - copper, copper)):
+        costs[:, layout.flow[0] + mixtures.arcs[component]] = prices[component] * flow
+    expected = (prices[0] * (flows[:, :4] - copper) ** 2 + prices[1] * copper**2).sum()
+    costs[-1, layout.last] = price = random.uniform(0.0, 1.0, layout.last.stop - layout.last.start)
+    end = future.admissible.lifetimes.start_planned @ stocks[-1]
+    task = WindowTask(start, range(2), None, Continuation(costs, end), np.zeros(0), None)
+    charge = future.carry_out(replace(task, later=None), actions).value - future.carry_out(task, actions).value
+    assert charge == pytest.approx(expected + price @ end, rel=1e-9)
+    later = future.later(task)
+    assert later is not None and future.later(replace(task, later=None)) is None
+    assert (later.cost * np.concatenate([stocks[1:], flows], axis=1)).sum() == pytest.approx(charge, rel=1e-9)
+
+
+def test_a_plan_that_comes_about_needs_no_correction() -> None:
+    """What a program promises of contents is measured as what the simulator makes of it."""
+    env = MultiAgentVectorEnv(sorter(low=0.0, high=0.02), num_envs=1)
+    env.reset(seed=0)
+    control = MPC(min_service=1.0)
+    control.start(env, 0)
+    window = control._plans[0].window
+    assert window is not None
+    np.testing.assert_allclose(window.corrections[0].error, 0.0, atol=1e-3)

@@ -82,7 +82,9 @@ def import_(
         which = f"the adjusted table, which is up to {moved:.2g} {table.unit} from the original"
     say(f"simulated without agents, no flow is further than {report.largest_error:.2g} {table.unit} from {which}")
     if table.substances is not None:
-        distance = f"up to {100 * report.content_error:.2g} percentage points from the table, as stores mix"
+        distance = (
+            f"up to {100 * report.content_error:.2g} percentage points from {which.partition(',')[0]}, as stores mix"
+        )
         say(f"simulated contents of {', '.join(table.substances.names)} are {distance}")
     say(f"wrote {', '.join(map(str, report.files))}")
 

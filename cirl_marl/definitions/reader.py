@@ -224,7 +224,7 @@ def _further_mistakes(
     document: Mapping[str, Any], error: ValidationError, beside: tuple[DataFiles, str], fields: Mapping[str, Any]
 ) -> list[str]:
     """Look for mistakes behind the given ones, with misspelt values mended and unknown keys left out."""
-    corrected_document = copy.deepcopy(dict(document))
+    corrected_document, guesses = copy.deepcopy(dict(document)), list[str]()
     for item in error.errors():
         *path, last = [part for part in item["loc"] if part != "[key]" and not str(part).startswith("<")]
         table: Any = corrected_document
@@ -236,11 +236,13 @@ def _further_mistakes(
             del table[last]
         elif item["type"] in ("enum", "literal_error"):
             valid = choices(str(item["ctx"]["expected"]))
+            guesses.append(".".join(map(str, path)))
             table[last] = next(iter(difflib.get_close_matches(str(item["input"]), valid, n=1)), valid[0])
         else:
             return []
     try:
         _build(corrected_document, beside, **fields)
     except NetworkError as further:
-        return list(further.problems)
+        # what is wrong where a word was mended may be wrong with the guess alone
+        return [fault for fault in further.problems if fault.partition(": ")[0] not in guesses]
     return []

@@ -126,7 +126,7 @@ def import_flows(
         stocks=known_stocks,
         name=name,
         title=title or name,
-        source=source or f"imported from {flows.name}",
+        source=(source or f"imported from {flows.name}") + ("" if reconciliation is None else ", reconciled"),
     )
     definition = writer.files()
     changes = () if reconciliation is None else reconciliation.changes

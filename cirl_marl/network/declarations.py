@@ -304,7 +304,7 @@ def bound_problems(part_: Any, prefix: str = "") -> Iterator[str]:
         elif isinstance(declaration, Quantity) and value is not None:
             for number in value.extremes if isinstance(value, TimeDependent) else (value,):
                 if fault := declaration.bound_problem(number):
-                    yield f"{prefix}{name} {number} {fault}"
+                    yield f"{prefix}{name} {float(f'{number:.12g}')} {fault}"
                     break
 
 

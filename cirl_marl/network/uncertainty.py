@@ -457,6 +457,11 @@ def _uncertain_field(network: Specification, path: str) -> tuple[Any, str]:
     ]
     if isinstance(parts[id_], Compartment):
         options += ["control", CAPACITY]
+    if name.startswith(CONTENT) and kind == "nodes" and name not in options:
+        substances = [substance.id for substance in network.substances]
+        if (id_of := name.removeprefix(CONTENT)) not in substances:
+            raise KeyError(f"content: {unknown_name('substance', id_of, substances)}")
+        raise KeyError(f"'{name}' is not stated, so that nothing can be drawn")
     if name not in options:
         raise KeyError(unknown_name(f"number of {kind} that can be uncertain or disturbed", name, options))
     if name == CAPACITY and parts[id_].control is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -10,7 +11,7 @@ from cirl_marl.errors import unknown_name
 from cirl_marl.network.declarations import bound_problems
 from cirl_marl.network.elements import Arc, ControlKind, Law, Node
 from cirl_marl.network.initial_ages import content_edges
-from cirl_marl.network.series import Series, means
+from cirl_marl.network.series import Series, extremes, means
 from cirl_marl.network.specification import Specification
 from cirl_marl.network.split_fractions import SUMS
 from cirl_marl.network.substances import REMAINDER, changing_sources
@@ -50,8 +51,9 @@ def _content_problems(network: Specification, node: Node, substances: list[str])
         yield f"{subject}: it stores nothing, and what it hands on has the content of what enters it"
     series = [part for part in dict(node.content).values() if isinstance(part, Series)]
     edges = content_edges(network, node)
-    total = float(np.max(sum(means(part, edges) for part in dict(node.content).values())))
-    if total > 1 + SUMS:
+    parts = [means(part, edges) for part in dict(node.content).values()]
+    total = float(np.max(sum(parts)))
+    if total > 1 + SUMS and max(float(part.max()) for part in parts) <= 1:  # else that is the fault
         yield f"{subject}: its substances sum to {total:g} of its mass, more than 1"
     if node.history is not None:
         late = [part for part in series if part.times[0] > node.history.times[0]]
@@ -100,6 +102,10 @@ def _service_problems(network: Specification, substances: list[str]) -> Iterator
         on_the_way = [id_ for id_ in service.providers if service.quantity == "stock" and id_ in arcs]
         if on_the_way:
             yield f"{subject}: no content is measured of what is on the way along '{on_the_way[0]}'; ask for its flow's"
+        for end, part in (("low", service.low), ("high", service.high)):
+            most = extremes(part)[1]
+            if 1 < most < math.inf:
+                yield f"{subject}: {end} {most:g} is more than 1, all there is; say '%' or 'ppm' in its unit"
         if service.id in makes_up:
             yield f"{subject}: no flow makes up for a content; leave out makes_up_for"
 
