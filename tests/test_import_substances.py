@@ -578,3 +578,36 @@ def test_the_command_says_what_is_in_it(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     assert "'Mine' to 'Sorter' (2000, Copper): 4.4 →" in result.output
     assert "simulated contents of Copper are up to" in result.output
+
+
+def stored(tmp_path: Path, stocks: Sequence[Row]) -> ImportReport:
+    """Import a use whose stocks have substances."""
+    rows = [
+        *[["Mine", "Use", 2000, substance, value, "kt/year", "10 %"] for substance, value in (("", 10), ("Copper", 1))],
+        *[["Use", "Dump", 2000, substance, value, "kt/year", "10 %"] for substance, value in (("", 8), ("Copper", 2))],
+    ]
+    beside = table(tmp_path / "stocks.csv", stocks, ["process", "year", "substance", "value", "unit"])
+    return imported(tmp_path, rows, stocks=beside)
+
+
+@pytest.mark.parametrize(("value", "unit"), [(5, "%"), (5, "kt"), (5e3, "t"), (5e4, "ppm")])
+def test_tables_of_stocks_say_what_is_in_them(tmp_path: Path, value: float, unit: str) -> None:
+    """As a part or an amount; what leaves a year later, a quarter of it copper, says nothing then."""
+    report = stored(tmp_path, [["Use", 1999, "Copper", value, unit], ["Use", 1999, "", 100, "kt"]])
+    use = next(node for node in load_network(report.files[0]).nodes if node.id == "use")
+    assert dict(use.content)["copper"] == pytest.approx(0.05, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("row", "fault"),
+    [
+        (["Use", 1999, "Coper", 5, "%"], "stocks: unknown substance 'Coper'. Did you mean 'Copper'"),
+        (["Use", 1998, "Copper", 5, "%"], r"line 3: no row says what 'Use' holds in 1998"),
+        (["Use", 1999, "Copper", 120, "kt"], r"line 3: 1.2 of 'Use' is Copper"),
+        (["Use", 1999, "Copper", 5, "kg/m"], r"line 3: .* give a part"),
+    ],
+)
+def test_what_is_wrong_with_substances_in_stocks(tmp_path: Path, row: Row, fault: str) -> None:
+    """The line is named, and the nearest substance."""
+    with pytest.raises(CirlError, match=fault):
+        stored(tmp_path, [["Use", 1999, "", 100, "kt"], row])

@@ -96,7 +96,11 @@ def import_flows(
     table = read_flows(flows, sheet=sheet, unit=unit, year=year)
     if regions:
         table = table.of(regions)
-    known_stocks = {} if stocks is None else read_stocks(stocks, table.unit.rpartition("/")[0])
+    known_stocks, contents = ({}, {}) if stocks is None else read_stocks(stocks, table.unit.rpartition("/")[0])
+    substances = () if table.substances is None else table.substances.names
+    for substance in contents:
+        if substance not in substances:
+            raise CirlError(f"stocks: {unknown_name('substance', substance, substances)}")
     holders = _matching_processes(table, [*stores, *_stock_processes(table, known_stocks)], "store")
     table = Processes(table, holders).mix_substances()
     processes = Processes(table, holders)
@@ -124,6 +128,7 @@ def import_flows(
         processes=processes,
         roles=role_of,
         stocks=known_stocks,
+        stock_contents=contents,
         name=name,
         title=title or name,
         source=(source or f"imported from {flows.name}") + ("" if reconciliation is None else ", reconciled"),

@@ -88,6 +88,9 @@ class DefinitionWriter:
     processes: Annotated[Processes, "its processes"]
     roles: Annotated[Mapping[str, Role], "of sources, sinks and stores; others belong to the technosphere"]
     stocks: Annotated[Mapping[tuple[str, str, int], float], "by region, process and year, at its end"]
+    stock_contents: Annotated[
+        Mapping[str, Mapping[tuple[str, str, int], float]], "what part of stocks each substance is, likewise"
+    ]
     name: Annotated[str, "of the network, and of the data file"]
     title: Annotated[str, "in words"]
     source: Annotated[str, "where the numbers come from"]
@@ -110,8 +113,10 @@ class DefinitionWriter:
         self._arcs = {pair: names[texts[pair]] for pair in table.pairs}
         self._regions = identifiers(table.regions) if self._regional else {}
         self._substances: dict[str, Floats] = {}
+        self._substance_names: dict[str, str] = {}
         if table.substances is not None:
             ids = identifiers(table.substances.names)
+            self._substance_names = {id_: name for name, id_ in ids.items()}
             self._substances = {ids[name]: amounts for name, amounts in zip(ids, table.substances.amounts, strict=True)}
         self._separate_sources()
         self._handed_on = self._splits()
@@ -227,9 +232,9 @@ class DefinitionWriter:
             return []
         stores = [process for process in self.processes.of(ProcessKind.STORE) if self._first_stocks(process)]
         contents = {
-            f"content of {substance} in {self._nodes[store]}": content[:, 0]
+            f"content of {substance} in {self._nodes[store]}": content
             for store in self.processes.of(ProcessKind.STORE)
-            for substance, content in self._contents(self._pairs_from(store)).items()
+            for substance, (content, _) in self._first_contents(store).items()
         }
         rows: list[list[object]] = [
             ["region", "flow", "stock", *(f"stock of {self._nodes[store]}" for store in stores), *contents]
@@ -272,12 +277,24 @@ class DefinitionWriter:
             if kind is ProcessKind.SOURCE:
                 yield from self._stated_contents(id_)
             elif kind is ProcessKind.STORE:
-                source = _text(f"of what leaves it in {self.table.years[0]}")
-                for substance, content in self._contents(self._pairs_from(process)).items():
-                    place = f"value = {_short(content[0, 0])}"
+                for substance, (content, text) in self._first_contents(process).items():
+                    place, source = f"value = {_short(content[0])}", _text(text)
                     if self._regional:
                         place = self._of_region(f"content of {substance} in {id_}")
                     yield f'content.{substance} = {{ {place}, unit = "1", source = {source} }}'
+
+    def _first_contents(self, process: str) -> dict[str, tuple[Floats, str]]:
+        """Return the content of a store at first by substance and region, and its source: of its stock, if known."""
+        before, outflow_text = self.table.years[0] - 1, f"of what leaves it in {self.table.years[0]}"
+        contents = {}
+        for substance, content in self._contents(self._pairs_from(process)).items():
+            of_stocks = self.stock_contents.get(self._substance_names[substance], {})
+            keys = [(region, process, before) for region in self.table.regions]
+            if of_stocks.keys() >= {*keys}:
+                contents[substance] = np.array([of_stocks[key] for key in keys]), self.source
+            else:
+                contents[substance] = content[:, 0], outflow_text
+        return contents
 
     def _stated_contents(self, source: str) -> Iterator[str]:
         """Yield the contents of a source: numbers where they stay the same."""

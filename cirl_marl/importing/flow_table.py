@@ -14,9 +14,9 @@ import numpy as np
 from cirl_marl.definitions.data_files import no_collection, number_in
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.importing.grids import Grid, GridPart, Memo, is_year, read_grids
-from cirl_marl.importing.substance_flows import SubstanceFlows, SubstanceRows
+from cirl_marl.importing.substance_flows import SubstanceFlows, SubstanceRows, amount_scale
 from cirl_marl.network import Floats, Integers
-from cirl_marl.network.declarations import positional_record
+from cirl_marl.network.declarations import SMALLEST, positional_record
 from cirl_marl.network.units import factor
 
 LAST_YEAR = 9999
@@ -186,29 +186,59 @@ def _check_repetitions(table: FlowTable, parts: Sequence[_Entries]) -> None:
     raise CirlError(f"{name}, line {line}: {flow} stands in line {first} too; leave one out, or give them types")
 
 
-def read_stocks(path: Path, unit: str) -> dict[tuple[str, str, int], float]:
-    """Return stocks by region, process and year, in a unit of mass.
+StockKey = tuple[str, str, int]
+"""Region, process and year of a stock."""
 
-    The table is long, with the columns process, year, value and unit, and may have region.
+
+def read_stocks(path: Path, unit: str) -> tuple[dict[StockKey, float], dict[str, dict[StockKey, float]]]:
+    """Return stocks by region, process and year, in a unit of mass, and what part of them each substance is.
+
+    The table is long, with the columns process, year, value and unit, and may have region and substance; of a substance
+    it has an amount, or the part that it is of the stock.
 
     Raises:
         CirlError: naming file, line, column and value, with what to do.
     """
-    stocks: dict[tuple[str, str, int], float] = {}
+    stocks: dict[StockKey, float] = {}
+    contents: dict[str, dict[StockKey, float]] = {}
+    parts: list[GridPart] = []
     for grid in read_grids(path, None):
         grid.require(("process", "year", "value", "unit"))
         factors = Memo[str, float](lambda text: factor(text.strip(), unit))
         for part in grid.parts():
-            years = part.convert(part.of("year"), Memo(_year))
-            values = part.numbers(grid.places["value"], part.of("value")).tolist()
-            scales = part.convert(part.of("unit"), factors)
-            cells = zip(part.of("region"), part.of("process"), years, part.lines, values, scales, strict=True)
-            for region, process, year, line, value, scale in cells:
-                key = region.strip(), process.strip(), year
+            is_whole = [not name.strip() for name in part.of("substance")]
+            parts.append(part.rows_in(np.logical_not(is_whole).tolist()))
+            wholes = part.rows_in(is_whole)
+            scales = wholes.convert(wholes.of("unit"), factors)
+            for (key, line, value), scale in zip(_stock_rows(wholes), scales, strict=True):
                 if key in stocks:
-                    raise CirlError(f"{grid.name}, line {line}: a stock of '{key[1]}' in {year} stands there already")
+                    raise CirlError(f"{grid.name}, line {line}: a stock of '{key[1]}' in {key[2]} stands there already")
                 stocks[key] = value * scale
-    return stocks
+    for part in parts:
+        rows = zip(_stock_rows(part), part.of("substance"), part.of("unit"), strict=True)
+        for (key, line, value), name, text in rows:
+            subject, content = f"{part.grid.name}, line {line}", contents.setdefault(name.strip(), {})
+            if key in content:
+                raise CirlError(f"{subject}: {name.strip()} of '{key[1]}' in {key[2]} stands there already")
+            if key not in stocks:
+                raise CirlError(f"{subject}: no row says what '{key[1]}' holds in {key[2]} in all; give it")
+            scale, is_part = amount_scale(subject, text, f"{unit}/year")
+            content[key] = value * scale if is_part else value * scale / max(stocks[key], SMALLEST)
+            if not 0 <= content[key] <= 1:
+                raise CirlError(
+                    f"{subject}: {content[key]:.4g} of '{key[1]}' is {name.strip()}, and at most all of it can be"
+                )
+    return stocks, contents
+
+
+def _stock_rows(part: GridPart) -> Iterator[tuple[StockKey, int, float]]:
+    """Yield region, process and year of each row, its line and value."""
+    years = part.convert(part.of("year"), Memo(_year))
+    values = part.numbers(part.grid.places["value"], part.of("value")).tolist()
+    for region, process, year, line, value in zip(
+        part.of("region"), part.of("process"), years, part.lines, values, strict=True
+    ):
+        yield (region.strip(), process.strip(), year), line, value
 
 
 @positional_record

@@ -89,7 +89,7 @@ class SubstanceRows:
                 raise CirlError(f"{subject}: there is no such flow; give the flow itself in a row without substance")
             if lines[place]:
                 raise CirlError(f"{subject} stands in line {lines[place]} too; leave one out")
-            scale, is_part = _scale(f"{sheet}, line {line}", text or stated_unit, unit)
+            scale, is_part = amount_scale(f"{sheet}, line {line}", text or stated_unit, unit)
             scale *= flow if is_part else 1.0
             amounts[place], deviations[place] = value * scale, deviation * scale
             is_content[place], lines[place] = is_part, line
@@ -107,7 +107,7 @@ def _cell(grid: Floats, place: tuple[int, ...]) -> float:
     return float(grid[place]) if within else np.nan
 
 
-def _scale(subject: str, text: str, unit: str) -> tuple[float, bool]:
+def amount_scale(subject: str, text: str, unit: str) -> tuple[float, bool]:
     """Return by what an amount in a unit is multiplied, and whether it is a part of the flow."""
     try:
         return factor(text, "1"), True
