@@ -20,12 +20,19 @@ def write_sections(document: Path, sections: Mapping[str, str]) -> None:
     """
     text = document.read_text(encoding="utf-8")
     for name, section in sections.items():
-        start, end = f"<!-- {name} -->", f"<!-- /{name} -->"
-        if start not in text or end not in text:
-            raise CirlError(f"{document}: has no marks {start} and {end} to write between")
-        before, rest = text.split(start, 1)
-        text = f"{before}{start}\n{wrapped(section)}\n{end}{rest.split(end, 1)[1]}"
+        before, _, after = _parts(document, text, name)
+        text = f"{before}\n{wrapped(section)}\n{after}"
     write_atomically(document, lambda path: path.write_text(text, encoding="utf-8"))
+
+
+def _parts(document: Path, text: str, name: str) -> tuple[str, str, str]:
+    """Return what stands up to the first mark of a section, between its marks, and from the last on."""
+    start, end = f"<!-- {name} -->", f"<!-- /{name} -->"
+    if start not in text or end not in text:
+        raise CirlError(f"{document}: has no marks {start} and {end}")
+    before, rest = text.split(start, 1)
+    section, after = rest.split(end, 1)
+    return before + start, section, end + after
 
 
 def wrapped(text: str) -> str:
@@ -50,6 +57,17 @@ def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str
     lines = ("| " + " | ".join(cells) + " |" for cells in (columns, *rows))
     head, *body = lines
     return "\n".join([head, "|" + "-|" * len(columns), *body])
+
+
+def table_rows(document: Path, section: str) -> list[list[str]]:
+    """Return the cells of the table of a section, without its headings; none if it has no table.
+
+    Raises:
+        CirlError: if the document lacks a mark.
+    """
+    _, text, _ = _parts(document, document.read_text(encoding="utf-8"), section)
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    return [line.removeprefix("| ").removesuffix(" |").split(" | ") for line in lines[2:]]
 
 
 def measured_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

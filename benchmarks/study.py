@@ -1,11 +1,13 @@
 """The study: every way of learning and controlling, on every network, against the proven bound (docs/study.md).
 
 ``python benchmarks/study.py`` trains what is missing, compares, and writes tables and pictures into the document. It
-can be stopped and started again: complete runs are kept. ``--only NETWORK`` restricts it, ``--table`` trains nothing.
+can be stopped and started again: complete runs are kept. ``--only NETWORK`` restricts it, ``--table`` trains nothing;
+rows of recipes that are not compared stay as they are.
 """
 
 from __future__ import annotations
 
+import csv
 import json
 import shutil
 import sys
@@ -20,7 +22,7 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from benchmarks.document import made_with, markdown_table, write_sections
+from benchmarks.document import made_with, markdown_table, table_rows, write_sections
 from cirl_marl.controllers import LQR, Controller, Neutral
 from cirl_marl.controllers.rollout import first_seed, rollout
 from cirl_marl.definitions.catalogue import load_network
@@ -35,7 +37,8 @@ from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats
 from cirl_marl.optimum import gap
 from cirl_marl.optimum.mpc import MPC, SERVICE_FIRST
-from cirl_marl.records.files import write_json
+from cirl_marl.records.files import write_json, write_table
+from cirl_marl.report.curves import PointSeries, save_fronts
 from cirl_marl.report.tradeoffs import write_comparison
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "study.md"
@@ -65,7 +68,15 @@ class Case:
     options: dict[str, Any] = field(default_factory=dict)
 
 
-RECIPES = ("exact_gradients", "independent_ars", "independent_ppo", "shared_ppo", "mappo", "joint_ppo")
+RECIPES = (
+    "exact_gradients",
+    "independent_ars",
+    "independent_ppo",
+    "central_critic_ppo",
+    "shared_ppo",
+    "mappo",
+    "joint_ppo",
+)
 CASES = {
     "copper_net": Case(RECIPES),
     "carbo_net": Case(RECIPES),
@@ -148,10 +159,10 @@ def main(
 ) -> None:
     """Train what is missing, compare, and write the tables and pictures of the document.
 
-    With fewer recipes, seeds, steps or episodes than the study has it is a trial, which writes a document of its own.
+    With other seeds, steps or episodes than the study has it is a trial, which writes a document of its own.
     """
     names = only or list(CASES)
-    trial = bool(recipes or steps) or (seeds, episodes) != (SEEDS, EPISODES)
+    trial = bool(steps) or (seeds, episodes) != (SEEDS, EPISODES)
     folder = write or (out / "trial" if trial else DOCUMENT.parent)
     results = RESULTS if folder == DOCUMENT.parent else folder / "results"
     document, pictures = folder / DOCUMENT.name, folder / "pictures"
@@ -169,9 +180,10 @@ def main(
     for name in names:
         runs = [run.path for job in planned if job.network == name and job.is_done() for run in job.runs]
         comparison = _compare(name, runs, episodes)
-        write_comparison(comparison, results / name, seeds=seeds, recipes=chosen)
+        past = None if trial else RESULTS / name
+        _publish(comparison, results / name, past, seeds=seeds, recipes=chosen)
         shutil.copyfile(results / name / "comparison.png", pictures / f"study_{name}.png")
-        sections[name] = "\n".join(_table(comparison))
+        sections[name] = "\n".join(_table(comparison, [] if trial else table_rows(document, name)))
     if {network for network, *_ in LQR_CASES} <= set(names):
         sections["lqr"] = "\n".join(_lqr_table(min(episodes, LQR_EPISODES)))
     sections["made"] = made_with()
@@ -212,15 +224,56 @@ def _compare(network: str, runs: Sequence[Path], episodes: int) -> Comparison:
         )
 
 
-def _table(comparison: Comparison) -> Iterator[str]:
+def _publish(comparison: Comparison, folder: Path, past: Path | None, **options: Any) -> None:
+    """Write the files of a comparison, and what those of a past one have of recipes that it lacks."""
+    network, names = comparison.network, {row.name for row in comparison.rows}
+    tables = {} if past is None else {name: list(_csv_rows(past / name)) for name in ("episodes.csv", "summary.csv")}
+    before = None if past is None else json.loads((past / "summary.json").read_text())
+    write_comparison(comparison, folder, **options)
+    if before is None:
+        return
+    for name, (_, *rows) in tables.items():
+        header, *fresh = _csv_rows(folder / name)
+        merged = [*fresh, *(row for row in rows if row[0] not in names)]
+        merged.sort(key=lambda row: _place(network.name, row[0]))
+        write_table(folder / name, header, merged)
+    summary = json.loads((folder / "summary.json").read_text())
+    summary["rows"] += [row for row in before["rows"] if row["name"] not in names]
+    summary["rows"].sort(key=lambda row: _place(network.name, row["name"]))
+    summary["provenance"]["runs"] += [run for run in before["provenance"]["runs"] if run["recipe"] not in names]
+    write_json(folder / "summary.json", summary)
+    points: dict[str, dict[str, list[list[float]]]] = {}
+    for name, seed, _, _, circularity, _, service, *_ in [*_csv_rows(folder / "episodes.csv")][1:]:
+        points.setdefault(name, {}).setdefault(seed, []).append([float(service), float(circularity)])
+    means = {name: np.array([np.mean(rows, axis=0) for rows in seeds.values()]) for name, seeds in points.items()}
+    series = [PointSeries(name, *rows.T) for name, rows in means.items()]
+    title = f"{network.title or network.name}: {comparison.episodes} episodes"
+    save_fronts(folder / "comparison.png", network, series, comparison.baseline.front, title=title)
+
+
+def _csv_rows(path: Path) -> Iterator[list[str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        yield from csv.reader(file)
+
+
+def _place(network: str, name: str) -> int:
+    """Return where a row stands: recipes first, then controllers."""
+    order = (*CASES[network].recipes, *CASES[network].controllers)
+    return order.index(name) if name in order else len(order)
+
+
+def _table(comparison: Comparison, published: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Yield the lines of a section; rows that are published of recipes that the comparison lacks stay."""
     unit = comparison.network.mass_unit
     heads = (f"λ̄ ({unit})", f"over neutral ({unit})", "lowest service", f"bound ({unit})", "gap to the bound")
     columns = ("", "algorithm", "who learns", "reward", "steps", *heads, "seeds", "CPU min")
-    rows = sorted(comparison.rows, key=lambda row: bool(row.seeds))
-    neutral = next(row for row in rows if row.name == "neutral").entries[0].circularity
-    yield from markdown_table(columns, [list(_cells(row, neutral, comparison.network.name)) for row in rows]).split(
-        "\n"
-    )
+    network, names = comparison.network.name, [row.name for row in comparison.rows]
+    neutral = comparison.rows[names.index("neutral")].entries[0].circularity
+    controllers = [list(_cells(row, neutral, network)) for row in comparison.rows if not row.seeds]
+    learners = [list(_cells(row, neutral, network)) for row in comparison.rows if row.seeds]
+    learners += [list(cells) for cells in published if cells[0] not in names]
+    learners.sort(key=lambda cells: _place(network, cells[0]))
+    yield from markdown_table(columns, [*controllers, *learners]).split("\n")
     yield ""
     yield f"{comparison.episodes} episodes each, the same for all."
     yield ""

@@ -15,7 +15,8 @@ from some import some
 from test_uncertain_bound import works
 
 from benchmarks import foresight, paper, study, uncertain
-from cirl_marl import MultiAgentVectorEnv, load_network
+from benchmarks.document import table_rows, write_sections
+from cirl_marl import MultiAgentVectorEnv, compare, load_network
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.lqr import LinearSystem
 from cirl_marl.controllers.rollout import first_seed, rollout
@@ -143,6 +144,36 @@ def outcomes(found: UncertainBound, make: foresight.Maker) -> tuple[Any, Any]:
     """Return λ̄ and levels of the episodes of a bound."""
     run = rollout(MultiAgentVectorEnv(found.network, num_envs=len(found.values)), make(), seed=first_seed(0))
     return run.episode_circularity, run.episode_levels
+
+
+def test_rows_of_recipes_that_are_not_compared_stay(tmp_path: Path) -> None:
+    """Tables, figures and picture have what is compared now, and of a past comparison what is not."""
+    past, both, now = (
+        compare((), names, network="carbo_net", episodes=episodes, bounds=False)
+        for names, episodes in ((("random", "neutral"), 2), (("random", "neutral"), 3), (("neutral",), 3))
+    )
+    for name, comparison in (("past", past), ("both", both)):
+        study._publish(comparison, tmp_path / name, None)
+    study._publish(now, tmp_path / "now", tmp_path / "past")
+    older, newer, whole = (
+        (tmp_path / name / "episodes.csv").read_text().splitlines() for name in ("past", "now", "both")
+    )
+    assert newer == [*(line for line in older if not line.startswith("neutral")), *whole[-3:]]
+    rows = {
+        name: json.loads((tmp_path / name / "summary.json").read_text())["rows"] for name in ("past", "now", "both")
+    }
+    assert [row["name"] for row in rows["now"]] == ["random", "neutral"]
+    assert rows["now"][0] == rows["past"][0]
+    assert rows["now"][1]["circularity"] == rows["both"][1]["circularity"] != rows["past"][1]["circularity"]
+    assert (tmp_path / "now" / "comparison.png").read_bytes() != (tmp_path / "past" / "comparison.png").read_bytes()
+    document = tmp_path / "study.md"
+    document.write_text("<!-- carbo_net -->\n<!-- /carbo_net -->\n")
+    write_sections(document, {"carbo_net": "\n".join(study._table(past, []))})
+    kept, _ = table_rows(document, "carbo_net")
+    published = [["mappo", "PPO"], kept, ["independent_ppo", "PPO"]]
+    lines = [line for line in study._table(now, published) if line.startswith("| ")][1:]
+    assert [line.split(" | ")[0] for line in lines] == ["| neutral", "| independent_ppo", "| mappo", "| random"]
+    assert lines[-1] == f"| {' | '.join(kept)} |"
 
 
 def test_kept_results_name_no_machine() -> None:
