@@ -152,25 +152,28 @@ def test_rows_of_recipes_that_are_not_compared_stay(tmp_path: Path) -> None:
         compare((), names, network="carbo_net", episodes=episodes, bounds=False)
         for names, episodes in ((("random", "neutral"), 2), (("random", "neutral"), 3), (("neutral",), 3))
     )
-    for name, comparison in (("past", past), ("both", both)):
+    for name, comparison in (("past", past), ("both", both), ("alone", now)):
         study._publish(comparison, tmp_path / name, None)
+    summary = json.loads((tmp_path / "past" / "summary.json").read_text())
+    summary["provenance"]["runs"] = [{"recipe": "mappo"}, {"recipe": "neutral"}]
+    (tmp_path / "past" / "summary.json").write_text(json.dumps(summary))
     study._publish(now, tmp_path / "now", tmp_path / "past")
     older, newer, whole = (
         (tmp_path / name / "episodes.csv").read_text().splitlines() for name in ("past", "now", "both")
     )
     assert newer == [*(line for line in older if not line.startswith("neutral")), *whole[-3:]]
-    rows = {
-        name: json.loads((tmp_path / name / "summary.json").read_text())["rows"] for name in ("past", "now", "both")
-    }
+    summaries = {name: json.loads((tmp_path / name / "summary.json").read_text()) for name in ("past", "now", "both")}
+    assert summaries["now"]["provenance"]["runs"] == [{"recipe": "mappo"}]
+    rows = {name: summary["rows"] for name, summary in summaries.items()}
     assert [row["name"] for row in rows["now"]] == ["random", "neutral"]
     assert rows["now"][0] == rows["past"][0]
     assert rows["now"][1]["circularity"] == rows["both"][1]["circularity"] != rows["past"][1]["circularity"]
-    assert (tmp_path / "now" / "comparison.png").read_bytes() != (tmp_path / "past" / "comparison.png").read_bytes()
+    assert (tmp_path / "now" / "comparison.png").read_bytes() != (tmp_path / "alone" / "comparison.png").read_bytes()
     document = tmp_path / "study.md"
     document.write_text("<!-- carbo_net -->\n<!-- /carbo_net -->\n")
     write_sections(document, {"carbo_net": "\n".join(study._table(past, []))})
     kept, _ = table_rows(document, "carbo_net")
-    published = [["mappo", "PPO"], kept, ["independent_ppo", "PPO"]]
+    published = [["mappo", "PPO"], kept, ["independent_ppo", "PPO"], ["neutral", "of old"]]
     lines = [line for line in study._table(now, published) if line.startswith("| ")][1:]
     assert [line.split(" | ")[0] for line in lines] == ["| neutral", "| independent_ppo", "| mappo", "| random"]
     assert lines[-1] == f"| {' | '.join(kept)} |"
