@@ -247,7 +247,7 @@ def _publish(comparison: Comparison, folder: Path, past: Path | None, **options:
         points.setdefault(name, {}).setdefault(seed, []).append([float(service), float(circularity)])
     means = {name: np.array([np.mean(rows, axis=0) for rows in seeds.values()]) for name, seeds in points.items()}
     series = [PointSeries(name, *rows.T) for name, rows in means.items()]
-    title = f"{network.title or network.name}: {comparison.episodes} episodes"
+    title = f"{network.name}: {comparison.episodes} episodes"
     save_fronts(folder / "comparison.png", network, series, comparison.baseline.front, title=title)
 
 

@@ -59,7 +59,10 @@ def test_a_trial_writes_a_document_of_its_own(tmp_path: Path, monkeypatch: pytes
     study.main(out=tmp_path, only=["carbo_net"], recipes=["joint_ppo"], seeds=1, steps=320, episodes=2, jobs=1)
     assert all(path.read_bytes() == text for path, text in published.items())
     assert "| joint_ppo | PPO | joint | team | 320 |" in (tmp_path / "trial" / "study.md").read_text()
-    assert (tmp_path / "trial" / "results" / "carbo_net" / "summary.json").is_file()
+    names = [cells[0] for cells in table_rows(tmp_path / "trial" / "study.md", "carbo_net")]
+    assert names == ["random", "neutral", "joint_ppo"]
+    summary = json.loads((tmp_path / "trial" / "results" / "carbo_net" / "summary.json").read_text())
+    assert sorted(row["name"] for row in summary["rows"]) == sorted(names)
     assert (tmp_path / "trial" / "pictures" / "study_carbo_net.png").is_file()
 
 
