@@ -191,8 +191,11 @@ def test_several_services_are_solved_together() -> None:
     np.testing.assert_allclose(cars[exact], np.array(network.interval_means(network.services[0].low))[exact], rtol=1e-9)
 
 
-def workshops(seed: int, count: int) -> Network:
-    """Return products with a maker each; makers pass to each other, get scrap back, and are fed by two sources."""
+def workshops(seed: int, count: int, *, is_fast: bool = False) -> Network:
+    """Return products with a maker each; makers pass to each other, get scrap back, and are fed by two sources.
+
+    Fast products come back as scrap within the interval, which is of two years.
+    """
     rng = np.random.default_rng(seed)
     nodes = [Node(id="ore", role=Role.NONRENEWABLE_RESERVOIR), Node(id="dump", role=Role.LANDFILL, initial=(0.0, 0.0))]
     arcs: list[Arc] = []
@@ -201,7 +204,8 @@ def workshops(seed: int, count: int) -> Network:
         nodes.append(Node(id=f"maker_{i}", stores=False))
         mean = float(rng.uniform(2.0, 20.0))
         lifetime = Lifetime(mean=mean, deviation=0.4 * mean, distribution="weibull")
-        nodes.append(Node(id=f"product_{i}", lifetime=lifetime, initial=(80.0, 120.0)))
+        use = {"rate": float(rng.uniform(0.5, 3.0))} if is_fast else {"lifetime": lifetime}
+        nodes.append(Node(id=f"product_{i}", initial=(80.0, 120.0), **use))
         services.append(
             Service(id=f"need_{i}", provider=f"product_{i}", quantity="stock", low=float(rng.uniform(70, 130)))
         )
@@ -229,16 +233,16 @@ def workshops(seed: int, count: int) -> Network:
         arcs.append(Arc(id=f"loss_{i}", recipient="dump", **scrap))
     return Network(
         name="workshops", nodes=tuple(nodes), arcs=tuple(arcs), services=tuple(services),
-        episode=Episode(horizon=4), time_unit="year",
+        episode=Episode(horizon=4, control_interval=1.0 + is_fast), time_unit="year",
     )  # fmt: skip
 
 
-@given(seed=st.integers(0, 2**31), count=st.integers(1, 7))
-@example(seed=859, count=3)  # what others supplied outweighed what a correction was expected to bring
+@given(seed=st.integers(0, 2**31), count=st.integers(1, 7), is_fast=st.booleans())
+@example(seed=859, count=3, is_fast=False)  # what others supplied outweighed what a correction was expected to bring
 @settings(max_examples=8)
-def test_nothing_lacks_that_can_be_had_and_nothing_is_supplied_in_vain(seed: int, count: int) -> None:
+def test_nothing_lacks_that_can_be_had_and_nothing_is_supplied_in_vain(seed: int, count: int, is_fast: bool) -> None:
     """What complementarity says, for random networks, whatever the agents do; and a copy is what it is alone."""
-    network = workshops(seed, count)
+    network = workshops(seed, count, is_fast=is_fast)
     traders = [arc.id for arc in network.arcs if arc.id.startswith("trade")] or ["mine_0_1"]
     env, lone = (MultiAgentVectorEnv(network, num_envs=n, agents=traders) for n in (3, 1))
     env.reset(seed=[1, 2, 3])

@@ -59,7 +59,7 @@ def _active_set(slope: Floats, shortage: Floats, supply: Floats, most: Floats, a
         under, over = is_free & (trial < 0), is_free & (trial > high)
         back = ~is_free & arrives[left] & (high > 0) & np.where(pinned > 0, excess < 0, excess > 0)
         is_settled = ~(under | over | back).any(axis=1) & np.isfinite(trial).all(axis=1)
-        solution[left[is_settled]], is_solved[left] = trial[is_settled], is_settled
+        solution[left[is_settled]], is_solved[left] = np.clip(trial, 0.0, high)[is_settled], is_settled
         if is_solved.all():
             break
         pinned_values[left] = np.where(under, 0.0, np.where(over, high, pinned))

@@ -8,7 +8,8 @@ U solves ::
 
 with D the lower ends of the services' bands: a linear complementarity problem. A is what arrives at once past nodes
 without stock (``Arrivals``), with a factor for each service: how much of what was expected of a correction has come
-about. Intervals are estimated by few terms of the solver's series until little lacks, then simulated; the last of these
+about. Where that does not lead there, as where much comes back within the interval, A is what secants make of it
+(Broyden). Intervals are estimated by few terms of the solver's series until little lacks, then simulated; the last of these
 is the interval itself. What others do in it is known. Nothing is said about a service whose supply cannot be enough:
 its level falls short.
 """
@@ -31,8 +32,8 @@ from cirl_marl.network.uncertainty import numbers_of
 
 CLOSE = 3e-10
 """Distance of what is measured from what is demanded, relative to that, at which nothing lacks."""
-ROUNDS = 12
-"""Most corrections."""
+ROUNDS, FACTOR_ROUNDS = 24, 4
+"""Most corrections, and those after which A is changed as a whole where factors have not led there."""
 LEVELS = ((2, 2e-2, 2), (6, 2e-5, 5), (None, 0.0, ROUNDS + 1))
 """Terms of the solver's series by which intervals are estimated; part of the demand below which what lacks will be
 little after one more correction; and most of these intervals. The last ones are simulated in full."""
@@ -174,6 +175,7 @@ class Supply:
         demand = self.demand_factors(self.demand.take(step, axis=1), factors)
         supply, base, expected = np.zeros((3, *demand.shape))
         factor, done = np.ones(demand.shape), None
+        change, slope = np.zeros_like(supply), np.zeros((batch, len(demand), len(demand)))
         all_controls[self.rows] = 1.0
         unit_rate = dynamics.rate(all_controls, step, factors)
         routes = dynamics.routing.routes(unit_rate)
@@ -199,11 +201,15 @@ class Supply:
                 is_wrong = open_ & (gap > CLOSE * demand).any(axis=0)
                 if not is_wrong.any() or (terms is None and correction == rounds - 1):
                     break
-                is_telling = is_wrong & (np.abs(expected) > NOTICEABLE[correction > 0] * demand)
-                factor *= np.divide(base - earlier, expected, out=np.ones_like(base), where=is_telling)
-                factor[factor <= 0] = 1.0  # what others supplied outweighed it
-                slope = self.slope(arrivals, range_.unit(extent))
-                slope = slope * np.ascontiguousarray((self.duration * factor).T)[..., None]
+                if terms is None and correction > FACTOR_ROUNDS:
+                    slope = _broyden(slope, change, np.where(is_wrong, base - earlier - expected, 0.0))
+                else:
+                    is_telling = is_wrong & (np.abs(expected) > NOTICEABLE[correction > 0] * demand)
+                    factor *= np.divide(base - earlier, expected, out=np.ones_like(base), where=is_telling)
+                    # what others supplied outweighed it; or the factor, of a whole row, has led nowhere
+                    factor[(factor <= 0) | (terms is None and correction == FACTOR_ROUNDS)] = 1.0
+                    slope = self.slope(arrivals, range_.unit(extent))
+                    slope = slope * np.ascontiguousarray((self.duration * factor).T)[..., None]
                 before, wrong = supply.copy(), np.flatnonzero(is_wrong)
                 short, now, most = (array.take(wrong, axis=1) for array in (shortage, supply, range_.most))
                 supply[:, wrong] = complementary(slope[wrong], short, now, most, self._interval)
@@ -260,6 +266,26 @@ class SupplyRange:
         has_room = (self.weights > 0) & ((extent < self._reach) | (self._reach >= self._furthest[self._of]))
         per_extent = self._total(np.where(has_room, self.weights, 0.0))[self._of]
         return np.divide(self.weights, per_extent, out=np.zeros_like(self.weights), where=has_room)
+
+
+def _broyden(slope: Floats, change: Floats, difference: Floats) -> Floats:
+    """Return A, shape (B, services, services), with the least change by which it tells what a change of supplies did.
+
+    Where nothing more of a service would arrive by it, its row stays.
+
+    Args:
+        slope: A.
+        change: ΔU, shape (services, B).
+        difference: Δq − A ΔU, likewise.
+
+    References: Broyden 1965, Mathematics of Computation 19, 577.
+    """
+    moved, error = np.ascontiguousarray(change.T), np.ascontiguousarray(difference.T)
+    size = (moved * moved).sum(axis=1)[:, None]
+    direction = np.divide(moved, size, out=np.zeros_like(moved), where=size > 0)
+    better: Floats = slope + error[:, :, None] * direction[:, None]
+    arrives = np.diagonal(better, axis1=1, axis2=2) > 0.0
+    return np.where(arrives[..., None], better, slope)
 
 
 def _of_copies(copies: Integers, *arrays: Any) -> Sequence[Any]:
