@@ -11,7 +11,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 from conftest import random_network, with_substances
-from hypothesis import assume, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from benchmarks.variants import without_substances
@@ -653,6 +653,9 @@ def test_contents_of_flows_are_in_the_ranges_of_programs(network: Network, seed:
 @given(
     network=substances_networks, seed=st.integers(0, 1000), degree=st.integers(1, 2), large=st.sampled_from((1, LARGE))
 )
+@example(  # slots of a fixed lifetime begin at other times than its history
+    network=with_substances(random_network(453209963, 10, 1, lifetimes=True), 453209963), seed=0, degree=1, large=1
+)
 @pytest.mark.medium
 def test_no_episode_with_its_contents_is_above_their_bound(
     network: Network, seed: int, degree: int, large: int
@@ -834,6 +837,15 @@ def test_mpc_keeps_contents(horizon: int | None, worst: float) -> None:
     run = controlled_by_mpc(load_network(EXAMPLE), horizon, 1.0)
     assert run.least_service[0] >= 0.9999
     assert run.episode_circularity[0] >= worst
+
+
+@pytest.mark.parametrize("options", [{"aim": "cost"}, {"at_most": {"cost": 1.0}}])
+def test_mpc_refuses_accounts_beside_contents(options: dict[str, Any]) -> None:
+    """Its windows climb for λ̄ and services alone; the message says what does more."""
+    network = replace(sorter(), accounts=(Account(id="cost", unit="EUR_2023"),))
+    env = MultiAgentVectorEnv(network, num_envs=1)
+    with pytest.raises(CirlError, match=r"network 'sorter': beside services of contents .* leave out at_most and aim"):
+        rollout(env, MPC(min_service=0.9, **options))
 
 
 def sorter(limit: float = 0.02, **service: Any) -> Network:

@@ -64,13 +64,22 @@ def _remaining_stages(
 
 
 def _past_edges(history: Series, interval: float) -> Floats:
+    """Return ends of intervals from when a history begins, of which the last may be short."""
     return np.append(np.arange(history.times[0], -1e-9 * interval, interval), 0.0)
+
+
+def _slot_edges(history: Series, interval: float) -> Floats:
+    """Return ends of the slots in which a history is, of which the first may be short."""
+    return np.append(history.times[0], interval * np.arange(2.0 - len(_past_edges(history, interval)), 1.0))
 
 
 def content_edges(network: Specification, node: Node) -> Floats:
     """Return the times between which contents of a node are stated: intervals of the episode, or of its history."""
     interval, horizon = network.episode.control_interval, network.episode.horizon
-    return _past_edges(node.history, interval) if node.history is not None else np.arange(horizon + 1.0) * interval
+    if node.history is None:
+        return np.arange(horizon + 1.0) * interval
+    has_slots = node.lifetime is not None and node.lifetime.chain is None
+    return _slot_edges(node.history, interval) if has_slots else _past_edges(node.history, interval)
 
 
 def age_shares(node: Node, interval: float) -> Floats:
@@ -143,7 +152,7 @@ def _past_content(node: Node, interval: float, content: Value, begin: float, end
     """Return the mean content of what entered between two times before the start; before the history its first."""
     assert node.history is not None
     start = node.history.times[0]
-    until = end if end > start else min(start + interval, 0.0)
+    until = end if end > start else float(_slot_edges(node.history, interval)[1])
     return float(means(content, np.array([max(begin, start), until]))[0])
 
 

@@ -7,7 +7,7 @@ A flow F = c·o·a·y follows from a control c, what else scales it, o ∈ [o̲,
 
 for all weighted means of F and y. The rows are exact where y = ȳ, as by schedule, and o is one value; else z counts at
 least the part y/ȳ. A flow that may be less than its control asks for has no row of the second kind: one that its donor
-or a capacity cuts, or a share beside beside that together may ask for more than 1. Factors on lifetimes have none.
+or a capacity cuts, or a share beside others that together may ask for more than 1. Factors on lifetimes have none.
 """
 
 from __future__ import annotations

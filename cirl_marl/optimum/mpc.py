@@ -203,13 +203,19 @@ class MPC(Planner):
 
         Raises:
             NoCertificate: for a network whose flows are not linear laws; see ``bound``.
-            CirlError: for another number of demanded levels than services.
+            CirlError: for another number of demanded levels than services, and for budgets or another aim than λ̄ beside
+                services of contents.
         """
         network, (horizon, replan, futures) = env.network, self._options
         self._aims = aims = aims_of(network, self._aim, self._at_most)
         self._levels = None if self._min_service is None else demanded_levels(network, self._min_service)
         has_contents = any(service.substance for service in network.services)
-        self._climbs = has_contents and aims.is_circular and futures is None
+        if has_contents and not (aims.is_circular and not aims.budgets):
+            raise CirlError(
+                f"network '{network.name}': beside services of contents MPC keeps no budgets and has no other aim than "
+                f"'{CIRCULARITY}'; leave out at_most and aim, or act by improve_plan(bound(...))"
+            )
+        self._climbs = has_contents and futures is None
         self.note, self._env, is_disturbed = "", env, bool(network.disturbed)
         if self._prices is not None and len(self._prices.service) > len(network.services):
             raise CirlError("prices: those of a bound with budgets, which no plan of one interval can keep")
@@ -371,7 +377,7 @@ class MPC(Planner):
         stock = self._env.physical.stock[self._env.rows.nodes, copy]
         planner = self._planner if is_outlook or self._drawn is None else self._planners[copy]
         plan = self._solve_task(planner, stock, intervals, demands, last, later, is_outlook=is_outlook)
-        if self._climbs and not is_outlook and not len(demands.limits):
+        if self._climbs and not is_outlook:
             plan = self._climb(planner, plan, last)
         if is_outlook or self._drawn is not None:
             return plan
