@@ -29,8 +29,10 @@ from cirl_marl import (
 from cirl_marl.cli import app
 from cirl_marl.importing import definition
 from cirl_marl.importing.assembly import ImportReport, import_flows
+from cirl_marl.importing.flow_table import read_stocks
 from cirl_marl.importing.substance_flows import closest_amounts, degrees_of_freedom
 
+LONG = ["process", "year", "substance", "value", "unit"]
 HEADER = ["source", "target", "year", "substance", "value", "unit", "uncertainty"]
 STOCKS = ["region", "process", "year", "value", "unit"]
 ROLES = {"nonrenewable_reservoir": ["Mine*"], "landfill": ["[DP]*[pt]"]}
@@ -586,7 +588,7 @@ def stored(tmp_path: Path, stocks: Sequence[Row]) -> ImportReport:
         *[["Mine", "Use", 2000, substance, value, "kt/year", "10 %"] for substance, value in (("", 10), ("Copper", 1))],
         *[["Use", "Dump", 2000, substance, value, "kt/year", "10 %"] for substance, value in (("", 8), ("Copper", 2))],
     ]
-    beside = table(tmp_path / "stocks.csv", stocks, ["process", "year", "substance", "value", "unit"])
+    beside = table(tmp_path / "stocks.csv", stocks, LONG)
     return imported(tmp_path, rows, stocks=beside)
 
 
@@ -598,6 +600,15 @@ def test_tables_of_stocks_say_what_is_in_them(tmp_path: Path, value: float, unit
     assert dict(use.content)["copper"] == pytest.approx(0.05, rel=1e-12)
 
 
+def test_all_of_a_stock_is_all_of_it(tmp_path: Path) -> None:
+    """Whatever rounding makes of its amount; of nothing there is nothing."""
+    path = table(tmp_path / "stocks.csv", [["Use", 1999, "", 0.7, "kt"], ["Use", 1999, "Copper", 700, "t"]], LONG)
+    assert read_stocks(path, "kt")[1]["Copper"] == {("", "Use", 1999): 1.0}
+    table(path, [["Use", 1999, "", 0, "kt"], ["Use", 1999, "Copper", 1, "kt"]], LONG)
+    with pytest.raises(CirlError, match=r"line 3: 1 kt of a stock of 0"):
+        read_stocks(path, "kt")
+
+
 @pytest.mark.parametrize(
     ("row", "fault"),
     [
@@ -605,6 +616,8 @@ def test_tables_of_stocks_say_what_is_in_them(tmp_path: Path, value: float, unit
         (["Use", 1998, "Copper", 5, "%"], r"line 3: no row says what 'Use' holds in 1998"),
         (["Use", 1999, "Copper", 120, "kt"], r"line 3: 1.2 of 'Use' is Copper"),
         (["Use", 1999, "Copper", 5, "kg/m"], r"line 3: .* give a part"),
+        (["Use", 1999, "Copper", 5, "kt/year"], r"line 3: .* an amount in kt"),
+        (["Use", 1999, "Copper", 5, ""], r"line 3: no unit"),
     ],
 )
 def test_what_is_wrong_with_substances_in_stocks(tmp_path: Path, row: Row, fault: str) -> None:

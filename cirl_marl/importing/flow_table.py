@@ -14,12 +14,14 @@ import numpy as np
 from cirl_marl.definitions.data_files import no_collection, number_in
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.importing.grids import Grid, GridPart, Memo, is_year, read_grids
-from cirl_marl.importing.substance_flows import SubstanceFlows, SubstanceRows, amount_scale
+from cirl_marl.importing.substance_flows import SubstanceFlows, SubstanceRows
 from cirl_marl.network import Floats, Integers
-from cirl_marl.network.declarations import SMALLEST, positional_record
+from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.units import factor
 
 LAST_YEAR = 9999
+ROUNDING = 1e-9
+"""By how much a part of a stock may be more than 1, as amounts round."""
 
 
 class Connection(NamedTuple):
@@ -222,13 +224,35 @@ def read_stocks(path: Path, unit: str) -> tuple[dict[StockKey, float], dict[str,
                 raise CirlError(f"{subject}: {name.strip()} of '{key[1]}' in {key[2]} stands there already")
             if key not in stocks:
                 raise CirlError(f"{subject}: no row says what '{key[1]}' holds in {key[2]} in all; give it")
-            scale, is_part = amount_scale(subject, text, f"{unit}/year")
-            content[key] = value * scale if is_part else value * scale / max(stocks[key], SMALLEST)
+            content[key] = _part_of_stock(subject, value, text.strip(), unit, stocks[key])
             if not 0 <= content[key] <= 1:
-                raise CirlError(
-                    f"{subject}: {content[key]:.4g} of '{key[1]}' is {name.strip()}, and at most all of it can be"
-                )
+                fault = f"{content[key]:.4g} of '{key[1]}' is {name.strip()}"
+                raise CirlError(f"{subject}: {fault}; it must be in [0, 1], in all of {stocks[key]:g} {unit}")
     return stocks, contents
+
+
+def _part_of_stock(subject: str, value: float, text: str, unit: str, stock: float) -> float:
+    """Return what part of a stock an amount of a substance is, or the part that is stated; 1 up to rounding is 1.
+
+    Raises:
+        CirlError: for a unit of neither.
+    """
+    remedy = f"of a substance give a part, as in %, or an amount in {unit}"
+    if not text:
+        raise CirlError(f"{subject}: no unit; {remedy}")
+    try:
+        part = value * factor(text, "1")
+    except CirlError:
+        try:
+            amount = value * factor(text, unit)
+        except CirlError as error:
+            raise CirlError(
+                f"{subject}: {error}; of a substance give a part, as in %, or an amount in {unit}"
+            ) from error
+        if amount and not stock:
+            raise CirlError(f"{subject}: {amount:g} {unit} of a stock of 0") from None
+        part = amount / stock if stock else 0.0
+    return min(part, 1.0) if part <= 1 + ROUNDING else part
 
 
 def _stock_rows(part: GridPart) -> Iterator[tuple[StockKey, int, float]]:
