@@ -479,7 +479,7 @@ def changed(**changes: Any) -> Network:
             lambda: mine(
                 disturbances={"noise": NOISE}, disturbed={"nodes.ore.content.cooper": DisturbanceEffect(by="noise")}
             ),
-            "unknown number of nodes that can be uncertain or disturbed 'content.cooper'. Did you mean 'content.copp",
+            "nodes.ore.content.cooper: content: unknown substance 'cooper'. Did you mean 'copper'?",
         ),
     ],
 )

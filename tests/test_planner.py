@@ -155,7 +155,8 @@ def test_the_best_of_a_round_counts_and_what_it_lacks_is_asked_for(monkeypatch: 
     def episode(plan: object) -> SimpleNamespace:
         worth, level = next(tried)
         levels = np.full((1, len(found.network.services)), level)
-        return SimpleNamespace(worth=worth, episode_levels=levels, accounts=np.empty((1, 0)))
+        nothing = np.empty((1, 0))
+        return SimpleNamespace(worth=worth, episode_levels=levels, accounts=nothing, bookings=nothing[..., None])
 
     class Step(SimpleNamespace):
         problem, scale, action = None, None, np.arange(found.actions.size).reshape(found.actions.shape)

@@ -31,6 +31,7 @@ from cirl_marl.learners.stacked.perceptrons import ACTIVATIONS, Layer, Perceptro
 from cirl_marl.learners.stacked.stack import StackedPolicies
 from cirl_marl.learners.trainer import Training
 from cirl_marl.learners.validation import Score, validation_score
+from cirl_marl.optimum.aims import Aims
 
 PPO_SMALL = {"n_steps": 10, "batch_size": 10, "n_epochs": 2, "policy_kwargs": {"net_arch": [8, 8]}}
 AGENTS = ["mine", "use", "sorting"]
@@ -364,11 +365,11 @@ def test_evaluations_act_by_stacks_as_by_policies(monkeypatch: pytest.MonkeyPatc
     """The same but for rounding, each training's own learners, in other numbers of copies, with central critics too."""
     seen: list[tuple[Score, Score]] = []
 
-    def watch(env: MultiAgentVectorEnv, policies: StackedPolicies) -> Score:
+    def watch(env: MultiAgentVectorEnv, policies: StackedPolicies, aims: Aims) -> Score:
         members = [member for stack, part in policies._parts for member in stack.members[part]]
         alone = Policies({member.name: member.policy for member in members})
         assert not policies.policies and len(members) == len({member.name for member in members})
-        seen.append((validation_score(env, policies), validation_score(env, alone)))
+        seen.append((validation_score(env, policies, aims), validation_score(env, alone, aims)))
         return seen[-1][0]
 
     monkeypatch.setattr(trainer, "validation_score", watch)
