@@ -9,9 +9,9 @@ U solves ::
 with D the lower ends of the services' bands: a linear complementarity problem. A is what arrives at once past nodes
 without stock (``Arrivals``), with a factor for each service: how much of what was expected of a correction has come
 about. Where that does not lead there, as where much comes back within the interval, A is what secants make of it
-(Broyden). Intervals are estimated by few terms of the solver's series until little lacks, then simulated; the last of these
-is the interval itself. What others do in it is known. Nothing is said about a service whose supply cannot be enough:
-its level falls short.
+(Broyden). Intervals are estimated by few terms of the solver's series until little lacks, then simulated; the last of
+these is the interval itself. What others do in it is known. Nothing is said about a service whose supply cannot be
+enough: its level falls short.
 """
 
 from __future__ import annotations
