@@ -10,6 +10,7 @@ import pytest
 from conftest import random_network, with_substances
 from hypothesis import given
 from hypothesis import strategies as st
+from test_substances import rollout_of
 
 from benchmarks.variants import without_substances
 from cirl_marl import Arc, Episode, Law, Network, NetworkError, Node, Role, Service, Substance
@@ -50,18 +51,6 @@ def quarry(**changes: Any) -> Network:
     return Network(**parts | changes)
 
 
-def masses_of(network: Network, copies: int = 1, seed: int = 0) -> tuple[MultiAgentVectorEnv, list[np.ndarray]]:
-    """Return an environment at the end of an episode, and its masses at the start and after each interval."""
-    env = MultiAgentVectorEnv(network, num_envs=copies)
-    env.reset(seed=seed)
-    random, masses = np.random.default_rng(seed), [env.physical.stock]
-    for _ in range(network.episode.horizon):
-        entries = len(env.actuators.control_rows)
-        env.advance(np.repeat(random.uniform(-1, 1, (entries, 1)), copies, axis=1))
-        masses.append(env.physical.stock)
-    return env, masses
-
-
 def by_component(env: MultiAgentVectorEnv, masses: np.ndarray) -> np.ndarray:
     """Return all that there is of each component, on the way too, shape (components, B)."""
     rows, parts = env.rows, env.rows.components
@@ -72,7 +61,7 @@ def by_component(env: MultiAgentVectorEnv, masses: np.ndarray) -> np.ndarray:
 
 def test_a_batch_keeps_what_its_donor_had_when_it_left() -> None:
     """By hand: 12 of 102 t on day 1, of which 30 leave; more copper comes to the heap, less of it to the batch."""
-    env, masses = masses_of(quarry())
+    env, masses = rollout_of(quarry(), 1, 0)
     content = [12.0 / 102.0]
     content.append((12.0 - 30.0 * content[0] + 2.0) / 74.0)
     copper = [env.rows.substances(table)[2, 0] for table in masses]
@@ -101,7 +90,7 @@ def test_flows_of_batches_have_their_content() -> None:
 def test_a_donor_that_is_short_sends_what_it_has_of_each() -> None:
     """Both arcs get their part of it, at one content, and nothing goes below 0."""
     arcs = [replace(arc, batches=tuple((time, 10 * mass) for time, mass in arc.batches)) for arc in quarry().arcs]
-    env, masses = masses_of(quarry(arcs=tuple(arcs)))
+    env, masses = rollout_of(quarry(arcs=tuple(arcs)), 1, 0)
     copper, whole = (
         np.array([part(table)[:, 0] for table in masses]) for part in (env.rows.substances, env.rows.stocks)
     )
@@ -113,7 +102,7 @@ def test_a_donor_that_is_short_sends_what_it_has_of_each() -> None:
 @given(network=batch_networks, seed=st.integers(0, 1000))
 def test_substances_in_batches_are_conserved(network: Network, seed: int) -> None:
     """Each to 1e-12 of its mass, on the way too; none is negative; observations are within their bounds."""
-    env, masses = masses_of(network, 2, seed)
+    env, masses = rollout_of(network, 2, seed)
     start = by_component(env, masses[0])
     for table in masses:
         np.testing.assert_allclose(by_component(env, table), start, rtol=1e-12, atol=1e-280)
@@ -128,7 +117,7 @@ def test_substances_in_batches_are_conserved(network: Network, seed: int) -> Non
 @given(network=batch_networks, seed=st.integers(0, 1000))
 def test_a_copy_with_batches_is_a_lone_environment(network: Network, seed: int) -> None:
     """Copy 1 of three is to the bit what starts alone with its seed."""
-    env, masses = masses_of(network, 3, seed)
+    env, masses = rollout_of(network, 3, seed)
     lone = MultiAgentVectorEnv(network, num_envs=1)
     lone.reset(seed=seed + 1)
     random = np.random.default_rng(seed)
@@ -144,7 +133,7 @@ def test_what_is_in_batches_changes_no_mass(seed: int, nodes: int, arcs: int) ->
     network = with_substances(random_network(seed, nodes, arcs), seed, batches=True)
     network = replace(network, arcs=tuple(arc for arc in without_substances(network).arcs))
     plain = without_substances(network)
-    (env, together), (other, masses) = masses_of(network), masses_of(plain)
+    (env, together), (other, masses) = rollout_of(network, 1, 0), rollout_of(plain, 1, 0)
     for whole, table in zip(together, masses, strict=True):
         size = table[:-1].sum()
         np.testing.assert_allclose(env.rows.stocks(whole), other.rows.stocks(table), rtol=1e-9, atol=1e-10 * size)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -39,10 +40,12 @@ from cirl_marl import (
 )
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import rollout
+from cirl_marl.dynamics.ledger import Ledger
 from cirl_marl.network.disturbances import DisturbanceEffect, Markov
 from cirl_marl.network.uncertainty import Spread
 from cirl_marl.optimum import improve_plan, simulate_plan
 from cirl_marl.optimum.draw_proofs import Sampling
+from cirl_marl.optimum.linearised import ActionPlan, _Efforts
 from cirl_marl.report.account_tables import accounts_table
 
 COST = (Account(id="cost", unit="EUR_2023"),)
@@ -403,3 +406,25 @@ def test_efforts_that_cannot_be_meant_are_refused() -> None:
     with pytest.raises(NetworkError, match="effort must be 'cost': a number, got 'much'"):
         replace(sale, effort=much)
     assert ACCOUNTS[0].id == "cost"
+
+
+def test_efforts_of_a_window_are_those_of_the_episode_there() -> None:
+    """What a step changes is measured from the plan's own intervals, whose ranges change from year to year."""
+    network = trade()
+    order = replace(
+        ORDER,
+        neutral=Series(times=(0.0, 2.0, 4.0), values=(1.0, 3.0, 2.0), interpolation="step"),
+        high=Series(times=(0.0, 3.0), values=(8.0, 12.0), interpolation="step"),
+    )
+    network = replace(network, arcs=(replace(network.arcs[0], control=order),))
+    steps = network.episode.horizon
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (steps, len(network.agents)))
+    rates = Ledger(network).rates()[2]
+    parts = []
+    for first, last in ((0, steps), (2, 5)):
+        plan = SimpleNamespace(network=network, agents=network.agents, actions=actions[first:last])
+        parts.append(_Efforts.of(cast(ActionPlan, plan), rates[:, first:last], first))
+    whole, window = parts
+    assert whole.away.std() > 0 and whole.half.std(axis=0).max() > 0
+    np.testing.assert_array_equal(window.away, whole.away[2:5])
+    np.testing.assert_array_equal(window.half, whole.half[2:5])

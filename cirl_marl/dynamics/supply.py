@@ -202,12 +202,11 @@ class Supply:
                 if not is_wrong.any() or (terms is None and correction == rounds - 1):
                     break
                 if terms is None and correction > FACTOR_ROUNDS:
-                    slope = _broyden(slope, change, np.where(is_wrong, base - earlier - expected, 0.0))
+                    slope = _broyden(slope, change, base - earlier - expected)
                 else:
                     is_telling = is_wrong & (np.abs(expected) > NOTICEABLE[correction > 0] * demand)
                     factor *= np.divide(base - earlier, expected, out=np.ones_like(base), where=is_telling)
-                    # what others supplied outweighed it; or the factor, of a whole row, has led nowhere
-                    factor[(factor <= 0) | (terms is None and correction == FACTOR_ROUNDS)] = 1.0
+                    factor[factor <= 0] = 1.0  # what others supplied outweighed it
                     slope = self.slope(arrivals, range_.unit(extent))
                     slope = slope * np.ascontiguousarray((self.duration * factor).T)[..., None]
                 before, wrong = supply.copy(), np.flatnonzero(is_wrong)
