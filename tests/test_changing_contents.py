@@ -38,6 +38,7 @@ from cirl_marl.definitions.writer import definition_of
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network.disturbances import AutoRegression, DisturbanceEffect, Markov
 from cirl_marl.network.elements import Lifetime
+from cirl_marl.network.initial_ages import remaining_history
 from cirl_marl.network.uncertainty import Spread, network_of_intervals
 from cirl_marl.optimum.content_ranges import present_contents
 from cirl_marl.optimum.draw_proofs import Sampling
@@ -279,6 +280,16 @@ def test_derivatives_by_what_is_unforeseen(scarce: bool) -> None:
         difference = (value(part, 1e-6 * direction) - value(part, -1e-6 * direction)) / 2e-6
         assert difference == pytest.approx(float((slopes * direction).sum()), abs=1e-6 * (1 + np.abs(slopes).sum()))
         assert np.abs(slopes).max() > 1e-4
+
+
+def test_slots_before_a_history_have_its_first_content() -> None:
+    """That of its first piece, half an interval here: 0.2·(t + 2.5) is 0.05 from −2.5 to −2, and 0.2, 0.4 after it."""
+    ramp = Series(times=(-2.5, 0.0), values=(0.0, 0.5), interpolation="linear")
+    history = Series(times=(-2.5, 0.0), values=(8.0, 8.0))
+    node = Node(id="use", lifetime=Lifetime(mean=5.0, distribution="fixed"), history=history, growth=0.0)
+    copper, whole = remaining_history(node, 1.0, ramp), remaining_history(node, 1.0)
+    np.testing.assert_allclose(whole[:-1], 8.0)
+    np.testing.assert_allclose(copper[:-1] / whole[:-1], [0.4, 0.2, 0.05, 0.05, 0.05], rtol=1e-12)
 
 
 @pytest.mark.parametrize(
