@@ -102,7 +102,13 @@ def test_nobody_is_sent_for_what_is_claimed(tmp_path: Path, monkeypatch: pytest.
 
 @pytest.mark.parametrize(
     ("name", "content"),
-    [("a.json", "[1, 2]"), ("a.json", "{"), ("a.json", '{"done": "half"}'), ("b.json", '"' * 10_000)],
+    [
+        ("a.json", "[1, 2]"),
+        ("a.json", "{"),
+        ("a.json", '{"done": "half"}'),
+        ("a.json", '{"done": 1, "total": 2, "cpu_seconds": null}'),
+        ("b.json", '"' * 10_000),
+    ],
 )
 def test_progress_that_no_job_told(name: str, content: str, tmp_path: Path) -> None:
     """A file of somebody else's is refused, named, and cited briefly."""

@@ -99,6 +99,8 @@ class JobFiles:
         done, total = content.get("done"), content.get("total")
         if content and not (done is not None and total is not None and 0 <= done < MOST and 0 < total < MOST):
             raise RunError(f"{self.progress_file}: is not what a job told: {done} is done of {total}")
+        if content.get("cpu_seconds", 0.0) is None:
+            raise RunError(f"{self.progress_file}: is not what a job told: cpu_seconds is None")
         return content
 
     def last_words(self) -> str:
