@@ -9,15 +9,18 @@ from pathlib import Path
 from typing import Any, cast, get_args
 
 import jsonschema
+import numpy as np
 import pytest
+import torch
 from small_networks import ONE_OF_EACH
 
 import cirl_marl
-from cirl_marl import CirlError, DefinitionError, MultiAgentVectorEnv, RecipeError
+from cirl_marl import CirlError, DefinitionError, MultiAgentVectorEnv, RecipeError, Trained
 from cirl_marl.definitions.catalogue import folder
 from cirl_marl.learners.algorithms import algorithms, parameter_mistakes, parameters_of
 from cirl_marl.learners.interface import train
-from cirl_marl.learners.recipe import LearnerSettings, Match, Normalisation, Options, Recipe, load_recipe
+from cirl_marl.learners.policies import DifferentiablePolicy
+from cirl_marl.learners.recipe import LearnerSettings, Match, Normalisation, Options, Recipe, Run, load_recipe
 from docs.site.schemas import recipe_schema
 
 GOOD = """
@@ -64,6 +67,33 @@ def test_published_schema_is_up_to_date() -> None:
     for wrong in ({"rewrad": "mixed"}, {"reward": "mix"}, {"horizon": 0}):
         with pytest.raises(jsonschema.ValidationError):
             jsonschema.validate(document | {"environment": wrong}, published)
+
+
+def test_settings_that_came_later_are_written_if_they_say_something() -> None:
+    """So that cells of older sweeps keep their names; what is written is read again."""
+    plain = Recipe(name="plain", title="plain", learner=LearnerSettings(algorithm="PPO")).model_dump()
+    assert "epsilon" not in plain["learner"]["normalise"] and "at_most" not in plain["run"]
+    assert plain["learner"]["normalise"]["clip_reward"] == 10.0
+    plain["learner"]["normalise"]["epsilon"], plain["run"]["at_most"] = 0.01, {"cost": 0.0}
+    assert Recipe.model_validate(plain).model_dump() == plain
+
+
+@pytest.mark.parametrize("engine", ["lockstep", "stacked"])
+def test_what_hardly_varies_is_magnified_by_at_most_epsilon(engine: str, tmp_path: Path) -> None:
+    """The stock of a mine: 2 % less than in training is seen as 2 % less, in a kept run as well."""
+    calm = Normalisation(epsilon=0.01)
+    settings = LearnerSettings(algorithm="PPO", parameters={"n_steps": 8, "batch_size": 8}, normalise=calm)
+    small = Recipe(name="calm", title="calm", run=Run(steps=16, envs=1, evaluations=0), learner=settings)
+    trained = train("copper_net", small, agents=["mine"], horizon=9, engine=engine, directory=tmp_path / "run")
+    for policy in (trained.learners["mine"].policy, Trained(tmp_path / "run").policies["mine"]):
+        assert policy.normaliser is not None
+        rows = np.repeat([trained.env.reset(seed=0)["mine"][0]], 2, axis=0)
+        rows[1, 0] *= 0.98
+        normalised = np.asarray(policy.normaliser.normalize_obs(rows))
+        assert normalised[0, 0] - normalised[1, 0] == pytest.approx(0.02 / 0.1, rel=0.02)
+        change = DifferentiablePolicy(policy)(torch.tensor(rows)).diff(dim=0)
+        acted = np.diff(policy.model.predict(normalised, deterministic=True)[0], axis=0)
+        assert change.detach().numpy() == pytest.approx(acted, abs=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -259,6 +259,7 @@ MISTAKES: list[tuple[Callable[[Path], object], str | None, dict[str, Any], str]]
         {"normalise": {"observation": False}},
         "'mine' has normalise.observation = true, not false",
     ),
+    (lambda p: None, None, {"normalise": {"epsilon": 0.01}}, "'mine' has normalise.epsilon = 1e-08, not 0.01"),
 ]
 
 

@@ -336,5 +336,6 @@ def wrap_in_normaliser(env: VecEnv, spec: LearnerSettings, keys: list[str] | Non
         clip_obs=normalise.clip_observation,
         clip_reward=normalise.clip_reward,
         gamma=spec.parameters.get("gamma", 0.99),
+        epsilon=normalise.epsilon,
         norm_obs_keys=keys,
     )

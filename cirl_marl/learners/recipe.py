@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import (
     BaseModel,
@@ -43,6 +43,15 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    LATER: ClassVar[tuple[str, ...]] = ()
+    """Fields that version 0.1.0 lacks: they are written if they say something, so that cells of sweeps keep names."""
+
+    @model_serializer(mode="wrap")
+    def _without_later_defaults(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        settings: dict[str, Any] = write(self)
+        defaults = {key: type(self).model_fields[key].default for key in self.LATER}
+        return {key: value for key, value in settings.items() if key not in defaults or value != defaults[key]}
+
 
 class Options(Settings):
     """What a recipe may say of the environment; None takes the definition's."""
@@ -65,10 +74,16 @@ OPTIONS = tuple(Options.model_fields)
 class Normalisation(Settings):
     """Running normalisation by Stable-Baselines3's ``VecNormalize``, one per agent, saved with its policy."""
 
+    LATER = ("epsilon",)
     observation: StrictBool = True
     reward: StrictBool = True
     clip_observation: Limit = 10.0
     clip_reward: Limit = 10.0
+    epsilon: Limit = Field(
+        1e-8,
+        description="added to each variance: what varied less than its root while the learner learnt is not magnified, "
+        "so that the policy also acts where it differs",
+    )
 
     @property
     def is_on(self) -> bool:
@@ -179,6 +194,7 @@ class Match(LearnerSettings):
 class Run(Settings):
     """How long and in how many copies, by which engine, and which checkpoint counts; the command line overrides it."""
 
+    LATER = ("at_most",)
     steps: Count = Field(200_000, description="environment steps, summed over the copies")
     envs: Count = Field(16, description="copies of the environment")
     common_random_numbers: StrictBool = Field(
@@ -217,12 +233,6 @@ class Run(Settings):
         description="by how much the logarithm of that price is higher still, only as long as service is short by as "
         "much as it may be at all; lower as long as there is too much",
     )
-
-    @model_serializer(mode="wrap")
-    def _as_before_budgets(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out budgets that there are not, so that cells of sweeps keep the names they had before."""
-        settings: dict[str, Any] = write(self)
-        return {key: value for key, value in settings.items() if value or key != "at_most"}
 
 
 @dataclass(frozen=True, slots=True)

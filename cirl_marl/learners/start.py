@@ -90,9 +90,10 @@ def _take_over(source: Learner, learner: Learner) -> None:
 
 def _other_settings(source: LearnerSettings, target: LearnerSettings) -> Iterator[str]:
     """Yield which settings that a policy depends on differ."""
-    for key in ("scheme", "algorithm", "policy", "normalise.observation", "normalise.clip_observation"):
+    normalisation = [f"normalise.{key}" for key in ("observation", "clip_observation", "epsilon")]
+    for key in ("scheme", "algorithm", "policy", *normalisation):
         old, new = map(attrgetter(key), (source, target))
-        if old != new and not (key == "normalise.clip_observation" and not source.normalise.observation):
+        if old != new and (source.normalise.observation or key not in normalisation[1:]):
             yield f"has {key} = {_toml(old)}, not {_toml(new)}"
 
 
