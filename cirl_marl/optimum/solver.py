@@ -28,15 +28,20 @@ PRIMAL, DEVEX = 4, 1
 NO_PLAN = (highspy.HighsModelStatus.kInfeasible, highspy.HighsModelStatus.kUnboundedOrInfeasible)
 """As every variable is bounded, the latter means the former."""
 HighsOptions = Mapping[str, str | float]
+CLEANING = 2000
+"""Simplex iterations after interior points. Where these stop short, HiGHS goes on by simplex, without end in programs
+of 25 000 variables; after a crossover it takes a few."""
 SETTINGS: tuple[HighsOptions, ...] = (
-    {"solver": "ipx"},
+    {"solver": "ipx", "simplex_iteration_limit": CLEANING},
     {"solver": "ipx", "run_crossover": "off"},
+    {"solver": "ipx", "run_crossover": "off", "presolve": "off"},
     {"solver": "simplex", "presolve": "off"},
 )
 """Tried in turn, from nothing, until the certificate of an answer says that it is good.
 
 Crossover, which finds a basis for later programs, and presolve fail now and then: where residence times are a fraction
-of a control interval, rows fix a stock several times over. Interior points without them do not, and leave no basis.
+of a control interval, rows fix a stock several times over, and multipliers of merged rows go wrong. Interior points
+without them do not, and leave no basis.
 """
 EXTRA = "highspy_extras"
 """Package that brings HiPO."""
@@ -63,6 +68,8 @@ OPTIMAL = 1e-5
 """Relative distance of a plan from its certificate, up to which nothing else is tried."""
 NEAR = 2e-3
 """The same for a large program."""
+FAIR = 1e-4
+"""The same, up to which simplex from nothing, of which nobody knows how long it takes, is not tried."""
 USABLE = 1e-2
 """The same for the best answer of all, beyond which there is no bound."""
 
@@ -139,6 +146,8 @@ def solve(
         attempts = (*rough, *LARGE_SETTINGS) if find_spec(EXTRA) else LARGE_SETTINGS[1:]
     program = _ScaledProgram(problem, np.maximum(np.abs(problem.low), np.abs(problem.high)))
     for settings in (None, *attempts) if basis is not None else attempts:
+        if settings is SETTINGS[-1] and best <= FAIR:
+            break
         highs = program.run(settings, basis if settings is None else None, primal=same_rows, is_near=is_near)
         model_status = highs.getModelStatus()
         status, is_refused = highs.modelStatusToString(model_status), model_status in NO_PLAN
