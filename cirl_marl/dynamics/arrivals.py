@@ -58,11 +58,10 @@ class Crossings:
         """Return the products for ``rate``, shape (arcs, B), and its ``shares``, shape (x columns, B, y columns)."""
         batch = rate.shape[1]
         values = np.concatenate([self._x.repeat(batch, axis=1), self._y(rate[: self._y.shape[1]])])
-        by_copy = np.ascontiguousarray(values.T)
-        self._triangle.substitute(self._triangle.arrange(shares.factors.take(self._factors, 0)), by_copy[..., None])
+        self._triangle.substitute(self._triangle.arrange(shares.factors.take(self._factors, 0)), values, batch)
         x, y = (np.zeros((batch, columns, len(self._nodes))) for columns in self._columns)
         for full, (rows, columns, places) in zip((x, y), self._ends, strict=True):
-            full[:, columns, places] = by_copy[:, rows]
+            full[:, columns, places] = values[rows].T
         products = shares.pass_pivots(x, self._nodes) @ y.transpose(0, 2, 1)
         return np.ascontiguousarray(products.transpose(1, 0, 2))
 

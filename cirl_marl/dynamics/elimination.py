@@ -171,15 +171,15 @@ class EliminationOrder:
         return nodes, (givers, out), (getters, into)
 
     @cached_property
-    def triangles(self) -> tuple[Triangle, Triangle]:
+    def triangle(self) -> Triangle:
         """All rounds in one: what comes to nodes as they are eliminated; then, in reverse, what passes them.
 
-        The numbers of the one are what is given on, those of the other the inverse pivots and what comes back.
+        Its numbers are ``EliminatedShares.factors`` with the inverse pivots between what nodes give on and get back.
         """
         nodes, (givers, out), (getters, into) = self.factors
-        places, size = np.arange(len(nodes)), len(nodes)
-        rows, columns = np.append(places[::-1], size - 1 - getters), np.append(places, 2 * size - 1 - into)
-        return Triangle(out, givers, size), Triangle(rows, columns, size, before=size)
+        places, last = np.arange(len(nodes)), 2 * len(nodes) - 1
+        rows, columns = (out, last - places, last - getters), (givers, places, last - into)
+        return Triangle(np.concatenate(rows), np.concatenate(columns), 2 * len(nodes))
 
     @cached_property
     def transposed_rounds(self) -> list[tuple[RowSum, RowSum]]:
@@ -279,12 +279,11 @@ class EliminatedShares:
             self._visits = visits(shares.reshape(-1, len(core), len(core)), np.ascontiguousarray(values[core].T))
 
     @cached_property
-    def _numbers(self) -> tuple[Floats, Floats]:
-        """The numbers of ``triangles``, copy by copy."""
+    def _numbers(self) -> Floats:
+        """The numbers of ``triangle``."""
         nodes, (givers, _), _ = self._order.factors
         out, into = np.split(self.factors, [len(givers)])
-        ahead, back = self._order.triangles
-        return ahead.arrange(out), back.arrange(np.concatenate([self._inverse[nodes], into]))
+        return self._order.triangle.arrange(np.concatenate([out, self._inverse[nodes], into]))
 
     @property
     def factors(self) -> Floats:
@@ -310,27 +309,45 @@ class EliminatedShares:
         return part
 
     def _pass_core(self, core_inflow: Floats) -> Floats:
-        """Return what passes through the core for what enters it, shape (B, nodes of the core, n)."""
-        rows = np.ascontiguousarray(core_inflow.transpose(0, 2, 1))[:, :, None]
-        through: Floats = (rows @ self._visits[:, None])[:, :, 0].transpose(0, 2, 1)
-        return through
+        """Return what passes through the core for what enters it, shape (nodes of the core, B·n)."""
+        by_copy = core_inflow.reshape(len(core_inflow), len(self._visits), -1)
+        rows = np.ascontiguousarray(by_copy.transpose(1, 2, 0))[:, :, None]
+        through = (rows @ self._visits[:, None])[:, :, 0]
+        return through.transpose(2, 0, 1).reshape(core_inflow.shape)
 
     def throughput(self, inflow: Floats) -> Floats:
         """Return q in place of what enters from elsewhere, shape (nodes, B·n), with n columns for each copy."""
+        nodes = self._order.factors[0]
+        values = np.zeros((2 * len(nodes), inflow.shape[1]))
+        inflow.take(nodes, 0, out=values[: len(nodes)])
+        self.pass_through(values)
+        inflow[nodes] = values[: len(nodes) - 1 : -1]
+        return inflow
+
+    def pass_through(self, values: Floats) -> None:
+        """Set the second half of ``values``, which is 0, to q from the last node that is eliminated to the first.
+
+        The first half, shape (nodes, B·n), is what enters nodes from elsewhere, in that order; it is used up.
+        """
         # forward substitution in the order of elimination, then backward: (I − Pᵀ)⁻¹ = L⁻¹ D⁻¹ U⁻¹
-        core, batch = len(self._order.core), self._inverse.shape[1]
+        nodes, batch, core = self._order.nodes, self._inverse.shape[1], len(self._order.core)
+        if not kernels_round_products():
+            self._pass_rounds(values)
+        elif core:
+            triangle, numbers = self._order.triangle, self._numbers
+            triangle.substitute(numbers, values, batch, last=nodes)
+            values[nodes - core : nodes] = self._pass_core(values[nodes - core : nodes])
+            triangle.substitute(numbers, values, batch, first=nodes)
+        else:
+            # in one call; a round takes longer to call than to compute
+            self._order.triangle.substitute(self._numbers, values, batch)
+
+    def _pass_rounds(self, values: Floats) -> None:
+        """Do what ``pass_through`` does, round by round."""
+        nodes, core, batch = self._order.factors[0], self._order.core, self._inverse.shape[1]
+        inflow = np.empty_like(values[: len(nodes)])
+        inflow[nodes] = values[: len(nodes)]
         by_copy: Floats = inflow.reshape(len(inflow), batch, inflow.shape[1] // batch)
-        if self._steps and kernels_round_products():
-            # in two calls; a round takes longer to call than to compute
-            nodes, (ahead, back), (out, into) = self._order.factors[0], self._order.triangles, self._numbers
-            values = np.zeros((2, batch, len(nodes), by_copy.shape[2]))
-            values[0] = by_copy.take(nodes, 0).transpose(1, 0, 2)
-            ahead.substitute(out, values[0])
-            if core:
-                values[0, :, -core:] = self._pass_core(values[0, :, -core:])
-            back.substitute(into, values)
-            by_copy[nodes] = values[1, :, ::-1].transpose(1, 0, 2)
-            return inflow
 
         def send(total: RowSum, senders: Integers, parts: Floats) -> None:
             total.add_to(inflow, (by_copy.take(senders, 0) * parts[..., None]).reshape(-1, inflow.shape[1]))
@@ -338,12 +355,11 @@ class EliminatedShares:
         for round_, out, _ in self._steps:
             send(round_.forward, round_.donors, out)
         by_copy *= self._inverse[..., None]
-        if core:
-            core_inflow = by_copy[self._order.core].transpose(1, 0, 2)
-            by_copy[self._order.core] = self._pass_core(core_inflow).transpose(1, 0, 2)
+        if len(core):
+            inflow[core] = self._pass_core(inflow[core])
         for round_, _, into in reversed(self._steps):
             send(round_.backward, round_.sources, into)
-        return inflow
+        values[len(nodes) :] = inflow[nodes[::-1]]
 
     def worth(self, values: Floats) -> Floats:
         """Return, in place of the worth of what passes through each node, that of what enters it, shape (nodes, B).

@@ -136,8 +136,8 @@ class KronReduction:
     one are no more than the ways to it and from it, they lead past it.
 
     The rows of one array are worked through from the first to the last: masses, flows that differ from copy to copy,
-    constant nodes on the way, throughputs of the kept nodes, shares of these that differ, constant nodes on the way
-    again, and what masses change by.
+    constant nodes on the way, what enters and what passes the kept nodes as they are eliminated, their throughputs,
+    shares of these that differ, constant nodes on the way again, and what masses change by.
     """
 
     def __init__(self, laws: FlowLaws, factors: Sequence[float]) -> None:
@@ -151,7 +151,11 @@ class KronReduction:
         donors = routing.donors.tolist()
         varying_exits = [k for k, is_same in enumerate(routing.is_fixed) if donors[k] in place and not is_same]
         self._varying_arcs = routing.arcs[varying_exits]
-        self._senders = np.array([place[donors[k]] for k in varying_exits], dtype=np.intp)
+        kept_nodes, order = routing.detours.kept_nodes, routing.detours.elimination.factors[0]
+        # of throughputs, which stand from the last node that is eliminated to the first
+        row_of = 2 * len(order) - 1 - np.argsort(order)
+        senders = [*range(len(order)), *(place[donors[k]] for k in varying_exits)]
+        self._senders: Integers = row_of[np.array(senders, dtype=np.intp)]
 
         # nodes have the names that they have in ``detours``, and so has what stocks, the first of the masses, get
         mass, flow, share, end = np.cumsum(
@@ -162,24 +166,27 @@ class KronReduction:
         before = contract_hubs(inflow_rows, routing.detours.order)
         spread = _outflow_rows(routing, rates, range(share, end), varying_exits)
         after = contract_hubs(spread, routing.detours.order)
-        names: list[Sequence[int]] = [range(mass, flow), range(flow, share), before, routing.detours.kept_nodes]
+        inflows = [kept_nodes[i] for i in order]
+        names: list[Sequence[int]] = [range(mass, flow), range(flow, share), before, inflows, inflows[::-1], kept_nodes]
         names += [range(share, end), after, range(nodes, nodes + masses)]
         parts = spans(map(len, names))
-        self._masses, self._flows, hubs, self._kept_rows, self._varying_rows, _, self._change = parts
+        self._masses, self._flows, hubs, kept_inflows, passed, kept_rows, self._varying_rows, _, self._change = parts
         self._rest, size = slice(hubs.start, self._change.stop), self._change.stop
+        self._passing = slice(kept_inflows.start, passed.stop)
+        self._sent_rows = slice(kept_rows.start, self._varying_rows.stop)
         rows = [
             dict(zip(columns, range(part.start, part.stop), strict=True))
             for columns, part in zip(names, parts, strict=True)
         ]
-        self._inflow_matrix = square_matrix(inflow_rows, rows[0] | rows[1] | rows[2] | rows[3] | rows[6], size)
-        self._spread = square_matrix(spread, rows[3] | rows[4] | rows[5] | rows[6], size)
+        self._inflow_matrix = square_matrix(inflow_rows, rows[0] | rows[1] | rows[2] | rows[3] | rows[8], size)
+        self._spread = square_matrix(spread, rows[5] | rows[6] | rows[7] | rows[8], size)
 
     def mean(self, stock: Floats, routes: IntervalRoutes, terms: int | None, rate: Floats) -> Floats:
         """Return the mean of the masses over the substep for constant ``rate``, shape (masses, B)."""
         rates, shares = rate.take(self._varying_flows, 0), routes.rate.take(self._varying_arcs, 0)
         work: Floats = np.empty((self._change.stop, stock.shape[1]))
         mean: Floats = work[self._masses]
-        flows, kept_rows = work[self._flows], work[self._kept_rows]
+        flows, passing, sent_rows = work[self._flows], work[self._passing], work[self._sent_rows]
         varying_rows, change, rest = work[self._varying_rows], work[self._change], work[self._rest]
         mean[...] = stock
         for factor in self._factors[-(terms or len(self._factors)) :]:
@@ -187,8 +194,8 @@ class KronReduction:
             flows *= rates
             rest.fill(0.0)
             self._inflow_matrix.substitute(work)
-            routes.kept_nodes.throughput(kept_rows)
-            kept_rows.take(self._senders, 0, out=varying_rows, mode="clip")
+            routes.kept_nodes.pass_through(passing)
+            passing.take(self._senders, 0, out=sent_rows, mode="clip")
             varying_rows *= shares
             self._spread.substitute(work)
             change *= factor

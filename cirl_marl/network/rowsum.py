@@ -46,45 +46,52 @@ class Triangle:
     """Where the entries of a strictly lower triangular matrix stand; the numbers are given in each use, for each copy.
 
     The rows are gone through in their order, and in a row the entries as they were given. All copies are worked on in
-    one call, as blocks of one matrix: so many short rows that wait for each other would take longer to call for. The
-    first columns may be those of rows that stand ``before`` them and stay as they are.
+    one call, as diagonal blocks of one matrix: so many short rows that wait for each other would take longer to call
+    for.
     """
 
-    def __init__(self, rows: Integers, columns: Integers, size: int, before: int = 0) -> None:
+    def __init__(self, rows: Integers, columns: Integers, size: int) -> None:
         """Take the places of the entries in so many rows."""
-        self._size, self._before, self._order = size, before, np.argsort(rows, kind="stable")
+        self._order = np.argsort(rows, kind="stable")
         self._columns = columns[self._order]
-        self._ends: Integers = np.cumsum(np.bincount(rows, minlength=size))
-        self._blocks: dict[int, tuple[Integers, Integers]] = {}
+        self._counts: Integers = np.bincount(rows, minlength=size)
+        self._blocks: dict[int, tuple[Integers, Integers, Integers]] = {}
 
     def arrange(self, numbers: Floats) -> Floats:
         """Return the numbers of the entries, shape (entries, B), as ``substitute`` takes them."""
-        return np.ascontiguousarray(numbers.take(self._order, 0).T)
+        return numbers.reshape(-1).take(self._block(numbers.shape[1])[2])
 
-    def substitute(self, numbers: Floats, values: Floats) -> None:
-        """Replace ``values``, n for each row, by (I − W)⁻¹ values, as ``RowSum.substitute`` does.
+    def substitute(self, numbers: Floats, values: Floats, batch: int, first: int = 0, last: int | None = None) -> None:
+        """Replace rows of ``values``, shape (rows, B·n), by those of (I − W)⁻¹ values, as ``RowSum.substitute`` does.
 
-        In the C-contiguous array stand the rows before of all copies, copy by copy, then the rows of all.
+        Args:
+            numbers: of the entries, arranged.
+            values: a C-contiguous array, n columns for each copy.
+            batch: B.
+            first: the first row that is replaced; those before it hold what they should already.
+            last: the row after the last one.
         """
-        batch = len(numbers)
-        if batch not in self._blocks:
-            self._blocks[batch] = self._block(batch)
-        rows, columns = batch * self._size, batch * (self._before + self._size)
-        flat, entries = values.reshape(-1), (*self._blocks[batch], numbers.reshape(-1))
-        each = len(flat) // max(columns, 1)
-        result = flat[batch * self._before * each :]
+        starts, columns, _ = self._block(batch)
+        rows = slice(first * batch, (len(self._counts) if last is None else last) * batch)
+        starts, flat, each = starts[rows.start : rows.stop + 1], values.reshape(-1), values.shape[1] // batch
+        result, size = flat[rows.start * each : rows.stop * each], len(self._counts) * batch
         if each == 1:
-            csr_matvec(rows, columns, *entries, flat, result)
+            csr_matvec(rows.stop - rows.start, size, starts, columns, numbers, flat, result)
         else:
-            csr_matvecs(rows, columns, each, *entries, flat, result)
+            csr_matvecs(rows.stop - rows.start, size, each, starts, columns, numbers, flat, result)
 
-    def _block(self, batch: int) -> tuple[Integers, Integers]:
-        """Return where each row of all copies begins, and the columns of its entries."""
-        copies = np.arange(batch, dtype=np.intp)[:, None]
-        starts = np.append(0, self._ends + copies * len(self._columns))
-        later = (batch - 1) * self._before + copies * self._size
-        shifts = np.where(self._columns < self._before, copies * self._before, later)
-        return starts, (self._columns + shifts).ravel()
+    def _block(self, batch: int) -> tuple[Integers, Integers, Integers]:
+        """Return where each row of each copy begins, the columns of its entries, and where their numbers are."""
+        if batch not in self._blocks:
+            counts = self._counts.repeat(batch)
+            copies = np.tile(np.arange(batch, dtype=np.intp), len(self._counts)).repeat(counts)
+            starts = np.append(0, np.cumsum(counts))
+            firsts = (np.cumsum(self._counts) - self._counts).repeat(batch)
+            entries = np.arange(starts[-1]) - (starts[:-1] - firsts).repeat(counts)
+            block = starts, self._columns[entries] * batch + copies, self._order[entries] * batch + copies
+            narrow = np.int32 if max(starts[-1], len(counts)) < 2**31 else np.intp
+            self._blocks[batch] = block[0].astype(narrow), block[1].astype(narrow), block[2]
+        return self._blocks[batch]
 
 
 @cache
