@@ -95,10 +95,11 @@ class Dynamics(FlowLaws):
         step: Integers | None = None,
         factors: Floats | None = None,
         routes: IntervalRoutes | None = None,
+        rate: Floats | None = None,
     ) -> Transition:
         """Hold ``controls`` for one control interval; arguments are as in ``Transition`` and ``FlowLaws.rate``.
 
-        Who knows the ``routes`` of the interval's shares already gives them.
+        Who knows the ``routes`` of the interval's shares already, or the ``rate``, which is used up, gives them.
         In the physical mode scheduled flows are first cut to what their donor can deliver, so the realised flows may be
         lower than those asked for. Networks without time series and batches need no ``step``.
 
@@ -111,7 +112,8 @@ class Dynamics(FlowLaws):
                 f"network '{self.network.name}': advance needs step, the index of the control interval of each copy: "
                 f"time series and batches depend on it, those of arc '{self._needs_step[0]}' for one"
             )
-        rate = self.rate_of_components(stock, controls, step, factors)
+        rate = self.rate(controls, step, factors) if rate is None else rate
+        self._limit(rate, stock, step, factors)
         routes = routes or self.routing.routes(rate)
         stock, inner, total, rate, batch_mass = self._hold(stock, inner, controls, rate, routes, step, None)
         self._check_finite(stock, inner)
@@ -126,13 +128,13 @@ class Dynamics(FlowLaws):
         step: Integers,
         factors: Floats | None,
         routes: IntervalRoutes | None,
-        *,
         rate: Floats,
+        *,
         terms: int,
     ) -> tuple[Floats, Floats]:
         """Return roughly what an interval does, by so many ``terms`` of the exact solver's series; mass is conserved.
 
-        The other arguments are those of ``advance``, and what ``rate`` returns for them, which is used up.
+        The other arguments are those of ``advance``.
 
         Returns:
             stocks after the interval, shape (masses, B), and the mass moved along each arc, shape (arcs, B).

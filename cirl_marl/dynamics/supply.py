@@ -187,15 +187,15 @@ class Supply:
                 target = np.minimum(range_.low + range_.weights * extent, range_.high)
                 all_controls[self.rows] = np.where(idle, target, controls[self.rows])
                 copies, earlier, base = np.flatnonzero(open_), base, base.copy()
-                inputs = _of_copies(copies, stock, inner, all_controls, step, factors, routes)
+                rate = unit_rate.copy()
+                rate[self.indices] *= all_controls[self.rows]
+                inputs = _of_copies(copies, stock, inner, all_controls, step, factors, routes, rate)
                 if terms is None:
                     part = dynamics.advance(*inputs)
                     done = part if done is None or len(copies) == batch else _with_copies(done, copies, part)
                     base[:, copies] = self._quantities(part.stock, part.moved_mass)
                 else:
-                    rate = unit_rate.take(copies, axis=1)
-                    rate[self.indices] *= inputs[2][self.rows]
-                    base[:, copies] = self._quantities(*dynamics.estimate(*inputs, rate=rate, terms=terms))
+                    base[:, copies] = self._quantities(*dynamics.estimate(*inputs, terms=terms))
                 shortage = demand - base
                 gap = np.where(np.where(shortage > 0, supply < range_.most, supply > 0), np.abs(shortage), 0.0)
                 is_wrong = open_ & (gap > CLOSE * demand).any(axis=0)
@@ -249,11 +249,13 @@ class SupplyRange:
     def extents(self, supply: Floats) -> Floats:
         """Return v, at which arcs supply U, shape (services, B)."""
         extent, is_open = np.zeros_like(supply), np.ones(supply.shape, dtype=bool)
-        for _ in range(self._bends):  # U is concave in v: each tangent leads past a bend, or to the end
+        for bend in range(1, self._bends + 1):  # U is concave in v: each tangent leads past a bend, or to the end
             of_arcs = extent[self._of]
             lack = supply - self._total(self.weights * np.minimum(of_arcs, self._reach))
             per_extent = self._total(np.where(of_arcs < self._reach, self.weights, 0.0))
             extent += np.divide(lack, per_extent, out=np.zeros_like(lack), where=is_open & (per_extent > 0))
+            if bend == self._bends:
+                break
             is_open = self._total(np.where((extent[self._of] > self._reach) & (of_arcs < self._reach), 1.0, 0.0)) > 0
             if not is_open.any():
                 break
