@@ -12,8 +12,10 @@ from cirl_marl.network.compartment_model import Bools
 
 TINY = 1e-9
 """Part of a supply that arrives in an interval, below which it is taken for none."""
-SWEEPS, CHANGES = 500, 30
-"""Most Gauss-Seidel sweeps, and changes of which supplies are at their bounds."""
+CHANGES, PIVOTS = 30, 10
+"""Most changes of which supplies are at their bounds, and complementary pivots for each of these bounds."""
+ROUNDING = 1e-12
+"""What is taken for 0 in pivots."""
 
 
 def complementary(slope: Floats, shortage: Floats, supply: Floats, most: Floats, interval: float) -> Floats:
@@ -32,10 +34,11 @@ def complementary(slope: Floats, shortage: Floats, supply: Floats, most: Floats,
     # more of what does not arrive is not supplied
     arrives = np.diagonal(slope, axis1=1, axis2=2) > TINY * min(1.0, interval)
     if len(shortage) == 1:
-        return _gauss_seidel(slope, short, now, high, arrives).T
+        step = np.divide(short, slope[:, 0], out=np.zeros_like(short), where=arrives)
+        return np.clip(now + step, 0.0, high).T
     solution, is_solved = _active_set(slope, short, now, high, arrives)
-    if not is_solved.all():
-        solution = np.where(is_solved[:, None], solution, _gauss_seidel(slope, short, now, high, arrives))
+    for copy in np.flatnonzero(~is_solved).tolist():
+        solution[copy] = _complementary_pivots(*(array[copy] for array in (slope, short, now, high, arrives)))
     return np.ascontiguousarray(solution.T)
 
 
@@ -43,7 +46,7 @@ def _active_set(slope: Floats, shortage: Floats, supply: Floats, most: Floats, a
     """Return V as ``complementary`` does, shape (B, services), and in which copies it is found.
 
     All supplies between their bounds are solved for together; then it is changed which these are, from those that are
-    now. A copy for which that comes to no end is left to others.
+    now. A copy for which that comes to no end is left to complementary pivots.
     """
     target = shortage + (slope * supply[:, None]).sum(axis=2)
     at_bound = np.where(shortage > 0, supply >= most, supply <= 0)  # as if what lacks now lacked still
@@ -78,17 +81,67 @@ def _solve(matrix: Floats, target: Floats) -> Floats:
     return solution
 
 
-def _gauss_seidel(slope: Floats, shortage: Floats, supply: Floats, most: Floats, arrives: Bools) -> Floats:
-    """Return V as ``complementary`` does, shape (B, services), by projected Gauss-Seidel sweeps."""
-    count, solution = shortage.shape[1], supply.copy()
-    open_ = np.ones(len(shortage), dtype=bool)
-    for _ in range(SWEEPS):
-        before = solution.copy()
-        for s in range(count):
-            short = shortage[:, s] - (slope[:, s] * (solution - supply)).sum(axis=1)
-            step = np.divide(short, slope[:, s, s], out=np.zeros_like(short), where=arrives[:, s])
-            solution[:, s] = np.where(open_, np.clip(solution[:, s] + step, 0.0, most[:, s]), solution[:, s])
-        open_ &= (np.abs(solution - before) > 1e-15 * solution).any(axis=1)
-        if count == 1 or not open_.any():
-            break
+def _complementary_pivots(slope: Floats, shortage: Floats, supply: Floats, most: Floats, arrives: Bools) -> Floats:
+    """Return V of one copy as ``complementary`` does, shape (services,); shapes are without that of copies.
+
+    There may be several, as A need not be a P-matrix: services that each other's supplies serve more than their own.
+    """
+    target, solution = shortage + slope @ supply, supply.copy()
+    places = np.flatnonzero(arrives & (most > 0))
+    if not len(places):
+        return solution
+    target -= np.delete(slope, places, axis=1) @ np.delete(supply, places)
+    matrix, high, target = slope[np.ix_(places, places)], most[places], target[places]
+    # of parts of the most, and relative to what is measured, so that pivots compare what can be compared
+    scale = np.abs(target) + np.abs(matrix) @ high
+    part = _lemke(matrix * high / scale[:, None], target / scale)
+    is_free = (part > ROUNDING) & (part < 1.0 - ROUNDING)
+    values = np.where(is_free, target, np.where(part > 0.5, high, 0.0))
+    exact = _solve(np.where(is_free[:, None], matrix, np.eye(len(part)))[None], values[None])[0]
+    solution[places] = np.clip(np.where(np.isfinite(exact), exact, part * high), 0.0, high)
     return solution
+
+
+def _lemke(matrix: Floats, target: Floats) -> Floats:
+    """Return v in [0, 1] with A v ≥ b where v = 0, A v ≤ b where v = 1, and A v = b elsewhere.
+
+    With y for what lacks where v = 1 it is w = A v + y − b, s = 1 − v, of which none is negative and vᵀw = yᵀs = 0. As
+    A has no negative entry the matrix of this problem is copositive, and as v is bounded pivots lead to a solution.
+    Where they lead nowhere, as A is an estimate, what they came to is returned.
+
+    Args:
+        matrix: A, shape (services, services).
+        target: b, shape (services,).
+
+    References: Lemke 1965, Management Science 11, 681.
+    """
+    count = len(target)
+    size, unit = 2 * count, np.eye(count)
+    # columns: w and s, then v and y, what all rows are lent, and the values of what is basic
+    lent = 2 * size
+    table = np.zeros((size, lent + 2))
+    table[:, :size], table[:, lent], table[:, -1] = np.eye(size), -1.0, np.concatenate([-target, np.ones(count)])
+    table[:count, size:lent] = -np.concatenate([matrix, unit], axis=1)
+    table[count:, size : size + count] = unit
+    # of rows that lack most the last, so that all are positive lexicographically
+    basis, entering, row = np.arange(size), lent, size - 1 - int(table[::-1, -1].argmin())
+    for _ in range(PIVOTS * size if table[row, -1] < 0 else 0):
+        leaving, basis[row] = basis[row], entering
+        table[row] /= table[row, entering]
+        others = np.arange(size) != row
+        table[others] -= table[others, entering, None] * table[row]
+        if leaving == lent:
+            break
+        entering = (leaving + size) % lent
+        column = table[:, entering]
+        rows = np.flatnonzero(column > ROUNDING)
+        if not len(rows):
+            break
+        # lexicographic, so that no basis comes twice; what was lent goes first
+        ratios = table[rows][:, [-1, *range(size)]] / column[rows, None]
+        nearest = rows[ratios[:, 0] <= ratios[:, 0].min() + ROUNDING]
+        is_lender = basis[nearest] == lent
+        row = int(nearest[is_lender][0] if is_lender.any() else rows[np.lexsort(ratios.T[::-1])[0]])
+    values = np.zeros(lent + 1)
+    values[basis] = table[:, -1]
+    return np.clip(values[size : size + count], 0.0, 1.0)

@@ -10,12 +10,15 @@ with D the lower ends of the services' bands: a linear complementarity problem. 
 without stock (``Arrivals``), with a factor for each service: how much of what was expected of a correction has come
 about. Where that does not lead there, as where much comes back within the interval, A is what secants make of it
 (Broyden). Intervals are estimated by few terms of the solver's series until little lacks, then simulated; the last of
-these is the interval itself. What others do in it is known. Nothing is said about a service whose supply cannot be
-enough: its level falls short.
+these is the interval itself. What others do in it is known. A service whose supply cannot be enough falls short.
+
+U exists, as q is continuous and U bounded (Brouwer), but where supplies serve other services more than their own there
+may be several. A service that is off though it need not be, as corrections ran out, is told in a warning.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Container, Sequence
 from dataclasses import fields
 from typing import Any
@@ -23,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from cirl_marl.dynamics.arrivals import Arrivals
-from cirl_marl.dynamics.complementarity import complementary
+from cirl_marl.dynamics.complementarity import TINY, complementary
 from cirl_marl.dynamics.integrator import Dynamics, Transition
 from cirl_marl.dynamics.uncertain_factors import ControlFactors, RowFactors
 from cirl_marl.network import Floats, Integers, RowSum
@@ -34,9 +37,13 @@ CLOSE = 3e-10
 """Distance of what is measured from what is demanded, relative to that, at which nothing lacks."""
 ROUNDS, FACTOR_ROUNDS = 24, 4
 """Most corrections, and those after which A is changed as a whole where factors have not led there."""
+SECANTS, DIFFERENCE = 6, 1e-4
+"""Corrections by secants after which A is measured anew, and the part of the most by which it then shifts supplies."""
 LEVELS = ((2, 2e-2, 2), (6, 2e-5, 5), (None, 0.0, ROUNDS + 1))
 """Terms of the solver's series by which intervals are estimated; part of the demand below which what lacks will be
 little after one more correction; and most of these intervals. The last ones are simulated in full."""
+TOLD = 1e-6
+"""Part of a demand that, if it lacks though it could be had, is told in a warning."""
 CELLS = 80_000
 """Most masses of all copies together that are worked on at once; more do not stay in a cache."""
 NOTICEABLE = 3e-3, 1e-7
@@ -54,6 +61,7 @@ class Supply:
         rows: row of each among the controls.
         weights: of each, shape (arcs, 1).
         total: sums over the arcs of each service.
+        services: ids of these services.
         demand: D in each interval, shape (services, horizon).
         demand_factors: factors on it.
         drawn: factors on the bounds of ``rows``.
@@ -76,6 +84,7 @@ class Supply:
         self.weights = np.array(weights).reshape(-1, 1)
         self.total = RowSum(self.of, np.arange(len(made_up)), 1.0, (len(services), len(made_up)))
         demand = [network.interval_means(service.low) for service in services]
+        self.services, self._warned = order, set[int]()
         self.demand = np.array(demand).reshape(len(services), network.episode.horizon)
         numbers = numbers_of(dynamics.factors.ranges, "services", "low")
         self.demand_factors = RowFactors(
@@ -184,8 +193,7 @@ class Supply:
             open_ = np.ones(batch, dtype=bool)
             for correction in range(rounds):
                 extent = range_.extents(supply)[self.of]
-                target = np.minimum(range_.low + range_.weights * extent, range_.high)
-                all_controls[self.rows] = np.where(idle, target, controls[self.rows])
+                all_controls[self.rows] = np.where(idle, range_.amounts(extent), controls[self.rows])
                 copies, earlier, base = np.flatnonzero(open_), base, base.copy()
                 rate = unit_rate.copy()
                 rate[self.indices] *= all_controls[self.rows]
@@ -201,15 +209,18 @@ class Supply:
                 is_wrong = open_ & (gap > CLOSE * demand).any(axis=0)
                 if not is_wrong.any() or (terms is None and correction == rounds - 1):
                     break
+                before, wrong = supply.copy(), np.flatnonzero(is_wrong)
                 if terms is None and correction > FACTOR_ROUNDS:
                     slope = _broyden(slope, change, base - earlier - expected)
+                    if (correction - FACTOR_ROUNDS) % SECANTS == 0:
+                        inputs = _of_copies(wrong, stock, inner, controls, step, idle, factors, supply, base)
+                        slope[wrong] = self._measured_slope(*inputs)
                 else:
                     is_telling = is_wrong & (np.abs(expected) > NOTICEABLE[correction > 0] * demand)
                     factor *= np.divide(base - earlier, expected, out=np.ones_like(base), where=is_telling)
                     factor[factor <= 0] = 1.0  # what others supplied outweighed it
                     slope = self.slope(arrivals, range_.unit(extent))
                     slope = slope * np.ascontiguousarray((self.duration * factor).T)[..., None]
-                before, wrong = supply.copy(), np.flatnonzero(is_wrong)
                 short, now, most = (array.take(wrong, axis=1) for array in (shortage, supply, range_.most))
                 supply[:, wrong] = complementary(slope[wrong], short, now, most, self._interval)
                 change = supply - before
@@ -218,7 +229,58 @@ class Supply:
                 if not open_.any():
                     break
         assert done is not None
+        if (gap > TOLD * demand).any():
+            # where there is room, more would arrive, and no source has run out
+            room = np.where(shortage > 0, range_.most - supply, supply) > TOLD * range_.most
+            arrives = np.diagonal(slope, axis1=1, axis2=2).T > TINY * min(1.0, self._interval)
+            is_cut = done.moved_mass[self.indices] < (1.0 - TOLD) * self._interval * all_controls[self.rows]
+            could_move = room & arrives & (self.total(np.where(is_cut & idle, 1.0, 0.0)) == 0)
+            self._warn(np.where(could_move, gap, 0.0), demand, step)
         return all_controls, done
+
+    def _warn(self, gap: Floats, demand: Floats, step: Integers) -> None:
+        """Warn, once for each service, that corrections ran out before supplies were what they should be."""
+        for row, copy in np.argwhere(gap > TOLD * demand).tolist():
+            if row not in self._warned:
+                self._warned.add(row)
+                part = gap[row, copy] / demand[row, copy] if demand[row, copy] else np.inf
+                arcs = ", ".join(arc for arc, of in zip(self.arcs, self.of.tolist(), strict=True) if of == row)
+                warnings.warn(
+                    f"network '{self._dynamics.network.name}': service '{self.services[row]}' is {part:.3g} of its "
+                    f"demand off in interval {step[copy]} of copy {copy}; "
+                    f"{arcs} could make up for it, but corrections ran out",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
+
+    def _measured_slope(
+        self,
+        stock: Floats,
+        inner: Floats,
+        controls: Floats,
+        step: Integers,
+        idle: Bools,
+        factors: Floats | None,
+        supply: Floats,
+        base: Floats,
+    ) -> Floats:
+        """Return A, shape (B, services, services), by difference quotients around ``supply``, which gave ``base``."""
+        services, batch = supply.shape
+        copies, shifted = np.repeat(np.arange(batch), services), np.tile(np.arange(services), batch)
+        stock, inner, controls, step, idle, factors, supply, base = _of_copies(
+            copies, stock, inner, controls, step, idle, factors, supply, base
+        )
+        range_, place = SupplyRange(self, step, idle, factors), (shifted, np.arange(len(copies)))
+        most = range_.most[place]
+        shift = np.where(supply[place] < most / 2, DIFFERENCE, -DIFFERENCE) * most
+        supply, controls = supply.copy(), controls.copy()
+        supply[place] += shift
+        amounts = range_.amounts(range_.extents(supply)[self.of])
+        controls[self.rows] = np.where(idle, amounts, controls[self.rows])
+        done = self._dynamics.advance(stock, inner, controls, step, factors)
+        change = self._quantities(done.stock, done.moved_mass) - base
+        slope = np.divide(change, shift, out=np.zeros_like(change), where=shift != 0)
+        return np.ascontiguousarray(slope.reshape(services, batch, services).transpose(1, 0, 2))
 
     def _quantities(self, stock: Floats, moved_mass: Floats) -> Floats:
         """Return what the services measure at the end of an interval, shape (services, B)."""
@@ -260,6 +322,10 @@ class SupplyRange:
             if not is_open.any():
                 break
         return np.where(supply < self.most, extent, self._furthest)
+
+    def amounts(self, extent: Floats) -> Floats:
+        """Return what arcs supply at their extents, shape (arcs, B)."""
+        return np.minimum(self.low + self.weights * extent, self.high)
 
     def unit(self, extent: Floats) -> Floats:
         """Return what each arc carries of a further unit for its service, at the extents of arcs, shape (arcs, B)."""
