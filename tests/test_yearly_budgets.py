@@ -384,3 +384,68 @@ def test_mpc_in_a_disturbed_network_charges_for_years(futures: int | None) -> No
     difference = future.program(task, None).cost - future.program(replace(task, charges=np.zeros(0)), None).cost
     years = np.flatnonzero(difference.reshape(6, -1).any(axis=1))
     assert years.tolist() == [1]
+
+
+def with_random_demand(network: Network) -> Network:
+    """Return the city with a demand that nobody foresees."""
+    demand = AutoRegression(deviation=0.2, persistence=0.7, low=0.5, high=1.6)
+    effect = {f"services.{network.services[0].id}.low": DisturbanceEffect(by="demand")}
+    return replace(network, disturbances={"demand": demand}, disturbed=effect)
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("futures", [None, 2])
+def test_mpc_in_a_disturbed_network_keeps_each_year(futures: int | None) -> None:
+    """In each copy, whether a window has all of a year or a part of it; and serves as demanded, or nearly."""
+    certain = quarterly(4)
+    least = float(bound(certain, aim="emissions", min_service=0.9).accounts[1])
+    most = 1.15 * float(simulate_plan(bound(certain, aim="emissions", min_service=0.9)).bookings[0, 1].sum())
+    assert most > least
+    env = MultiAgentVectorEnv(with_random_demand(certain), num_envs=4)
+    control = MPC(min_service=0.9, at_most={"emissions/year": most}, futures=futures)
+    run = rollout(env, control, seed=1)
+    totals = run.bookings[:, 1].sum(axis=1)
+    assert (totals <= most * (1 + 5e-3)).all() and totals.mean() > 0.9 * most
+    assert run.episode_levels.mean() > 0.9 - 0.05
+    assert not control.note
+
+
+def test_a_window_may_book_its_part_of_what_a_year_has_left() -> None:
+    """What is planned for its intervals, and for each of them an equal part of what was booked less than planned."""
+    env = MultiAgentVectorEnv(with_random_demand(quarterly()), num_envs=1)
+    env.reset(seed=0)
+    control = MPC(min_service=0.5, at_most={"emissions/year": 1e4, "emissions": 3e4})
+    control.start(env, 0)
+    outlook, bookings = control._common_outlook, control._bookings
+    assert outlook is not None
+    reference = np.zeros((8, 3))
+    reference[:4, 0] = reference[4:, 1] = 0.2
+    reference[:, 2] = 0.1
+    limits, share = bookings.limits(0, range(0, 3), reference)
+    np.testing.assert_allclose(share, [3 / 4, 0.0, 0.0])
+    np.testing.assert_allclose(limits, [0.6 + 0.75 * 0.2, 0.0, np.inf])
+    env.step(control.act({}))
+    bookings.follow([False])
+    limits, share = bookings.limits(0, range(1, 4), reference)
+    np.testing.assert_allclose(share, [1.0, 0.0, 0.0])
+    np.testing.assert_allclose(limits[0], 1.0 - env.physical.accounts[1, 0] / env.ledger.discount[1, 0] / 1e4)
+    plan = control._plans[0].window
+    assert plan is not None
+    np.testing.assert_allclose(plan.task.charges[1:], outlook.charges[1:] * [0.0, 1.0] + [outlook.charges[1], 0.0])
+
+
+def test_a_service_is_dearer_until_it_is_ahead() -> None:
+    """Beside budgets, which come first; by what was delivered, not by what was planned."""
+    env = MultiAgentVectorEnv(with_random_demand(quarterly()), num_envs=2)
+    env.reset(seed=0)
+    control = MPC(min_service=0.5, at_most={"emissions/year": 1e4})
+    control.start(env, 0)
+    outlook = control._common_outlook
+    assert outlook is not None
+    env.physical.service[:] = [[0.0, 2.5]]
+    env.physical.step[:] = 4
+    prices = [control._present_price(copy, outlook) for copy in (0, 1)]
+    np.testing.assert_allclose(prices[1][2:], control._price)
+    np.testing.assert_allclose(prices[0], [*(10.0 * outlook.task.price[:2]), *(3.0 * control._price)])
+    env.physical.service[:] = 0.5 * 8 - 4 * 0.48  # what is left to deliver, 0.48 in the mean, is less, but hardly
+    np.testing.assert_allclose(control._present_price(0, outlook)[2:], 3.0 * control._price)

@@ -34,13 +34,13 @@ from cirl_marl.network.elements import CIRCULARITY, is_of_circularity
 from cirl_marl.network.innovations import innovations
 from cirl_marl.network.uncertainty import expected_network
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.aims import NO_AIMS, Aim, Aims, aims_of
+from cirl_marl.optimum.aims import Aim, Aims, aims_of
 from cirl_marl.optimum.draws import Prices
 from cirl_marl.optimum.futures import DrawnFutures
 from cirl_marl.optimum.options import check_margin, check_options, demanded_levels, starting_stocks, with_margin
 from cirl_marl.optimum.solver import Infeasible, SolverFailure
 from cirl_marl.optimum.window_climb import climb_window
-from cirl_marl.optimum.window_planner import Future, WindowPlanner
+from cirl_marl.optimum.window_planner import FIRST_PRICE, RISE, Future, WindowPlanner
 from cirl_marl.optimum.windows import EMPTY, Continuation, WindowPlan, WindowTask
 
 SERVICE_FIRST = 1000.0
@@ -51,6 +51,9 @@ WINDOW = 3
 """Decisions that a plan looks ahead where the network is disturbed, unless another number is asked for. What comes
 after them has its price, and nobody knows it: on paper_city and steel_japan longer windows did no better."""
 FROM_START = "MPC: budgets per year need every interval of an episode, from its start on"
+LEAD = 0.05
+"""Part by which less than the demanded level has to be enough for the rest of a disturbed episode with yearly budgets,
+before a service costs no more than in the plan of the expected episode."""
 NOTABLE = 2e-3
 """Part of a budget, or level of a service, by which a plan misses it and says so."""
 FIRST_SAMPLE, SAMPLES = 2**30, 256
@@ -76,6 +79,7 @@ class _Demands:
         default_factory=lambda: EMPTY
     )
     charges: Annotated[Floats, "of totals, in parts of budgets; empty for none"] = field(default_factory=lambda: EMPTY)
+    price: Annotated[Floats | None, "see ``WindowTask``; None: as in the plan before"] = None
 
 
 class _Bookings:
@@ -118,6 +122,24 @@ class _Bookings:
         remainder[self._by_year] = self._aims.limits[self._by_year] - self._in_years[:, copy]
         return remainder
 
+    def limits(self, copy: int, window: range, reference: Floats) -> tuple[Floats, Floats]:
+        """Return what a window may book of each budget, and which part of what is left of its year it has.
+
+        Of budgets of the episode, which hold in expectation, it may book anything.
+
+        Args:
+            copy: whose.
+            window: intervals.
+            reference: what a plan of the episode books, in parts of budgets, shape (horizon, budgets).
+        """
+        counts = (self._counts != 0).T
+        rest, within = counts[window.start :].sum(axis=0), counts[window.start : window.stop].sum(axis=0)
+        share = within / np.maximum(rest, 1)
+        left = self.remainders(copy) / self._aims.sizes - reference[window.start :].sum(axis=0)
+        is_yearly = np.isin(np.arange(len(left)), self._by_year)
+        limits = reference[window.start : window.stop].sum(axis=0) + share * left
+        return np.where(is_yearly, limits, np.inf), np.where(is_yearly, share, 0.0)
+
 
 class MPC(Planner):
     """Plans again and again from the current stocks; each copy has its own plan.
@@ -131,9 +153,11 @@ class MPC(Planner):
     An ``aim`` and budgets are those of ``bound``: what past intervals booked the planned ones have no more of. Whether
     a budget is kept depends on all that is to come, so that plans look to the end of the episode.
 
-    In a disturbed network ``min_service`` is of the *expected* levels, and budgets of expected totals: what lacks in
-    any interval, and all that is booked on budgeted accounts, is charged for at the multipliers of the plan for what is
-    expected, or those of the ``prices``, whatever was delivered before.
+    In a disturbed network ``min_service`` is of the *expected* levels: what lacks in any interval is charged for at the
+    multipliers of the plan for what is expected, or those of the ``prices``, whatever was delivered before, and so is
+    what is booked on budgets of the episode. Budgets per year hold in each copy as far as they can: with what is booked
+    already a window may book what is left of the year, less what is planned for after it, with an equal part of the
+    deviation for each interval to come. Beside them a service that is not ahead of its demand is dearer.
     """
 
     ahead = 0.1  # a first plan takes longer than the later ones, which start from it
@@ -235,7 +259,7 @@ class MPC(Planner):
         self._outlooks: dict[int, WindowPlan] = {}
         self._common_outlook: WindowPlan | None = None
         self._price = np.zeros(0)
-        self._bookings = _Bookings(NO_AIMS if is_disturbed else aims, env)  # there what is booked has its charges
+        self._bookings = _Bookings(aims, env)
         is_short = self._horizon is not None and self._horizon < network.episode.horizon
         if is_disturbed and (is_short or self._levels is not None or aims.budgets):
             self._common_outlook = outlook = self._expected_outlook()
@@ -249,7 +273,7 @@ class MPC(Planner):
         self._look_ahead(range(env.num_envs))
         for copy in range(env.num_envs):
             self._plans.append(self._next(copy, None))
-            self._note_excess(self._plans[copy].window)
+            self._note_excess(self._common_outlook or self._plans[copy].window)
             progress((copy + 1) / env.num_envs)
 
     def _note_excess(self, plan: WindowPlan | None) -> None:
@@ -310,12 +334,16 @@ class MPC(Planner):
             demands = _Demands(deficit, self._bookings.remainders(copy) / self._aims.sizes)
         else:  # no level is demanded, all that lacks has its price
             deficit = None if deficit is None else np.full(len(deficit), float(len(rest)))
-            demands = _Demands(deficit, charges=outlook.charges)
+            demands = _Demands(deficit, charges=outlook.charges, price=self._price)
+            if self._aims.has_years:
+                limits, share = self._bookings.limits(copy, window, outlook.bookings)
+                charges = np.where(share < 1, outlook.charges, 0.0)
+                demands = _Demands(deficit, limits, charges, self._present_price(copy, outlook))
         if last is None:
             self._outlooks.pop(copy, None)
         if len(window) == len(rest):
             plan = self._plan(copy, window, demands, last)
-            if last is None or not len(demands.limits):
+            if last is None or self._common_outlook is not None or not len(demands.limits):
                 return plan
             return self._planner.better_of(plan, last.actions[window.start - last.task.intervals.start :])
         if outlook is None and copy not in self._outlooks:
@@ -329,6 +357,19 @@ class MPC(Planner):
         if self._prices is not None:
             later = replace(later, costs=self._state_costs(later.costs, copy, window))
         return self._plan(copy, window, demands, last or outlook, later)
+
+    def _present_price(self, copy: int, outlook: WindowPlan) -> Floats:
+        """Return what a disturbed copy is charged for budgets that are exceeded and for services that lack.
+
+        Budgets come first. Beside them a service is dearer until what was delivered is ahead of what is demanded.
+        """
+        budgets, steps = len(self._aims.budgets), self._env.network.episode.horizon
+        if self._levels is None:
+            return np.append(RISE * outlook.task.price[:budgets], self._price)
+        state = self._env.physical
+        rest = (self._levels * steps - state.service[:, copy]) / (steps - state.step[copy])
+        service_price = self._price * np.where(rest >= (1.0 - LEAD) * self._levels, FIRST_PRICE, 1.0)
+        return np.append(RISE * outlook.task.price[:budgets], service_price)
 
     def _state_costs(self, costs: Floats, copy: int, window: range) -> Floats:
         """Return the costs of what comes after a window, with prices that follow the states of the disturbances.
@@ -411,10 +452,9 @@ class MPC(Planner):
         if demands.deficit is not None:  # no interval delivers more than all that is wanted
             demand = np.where(self._full, 1.0, np.clip(demands.deficit / len(intervals), 0.0, 1.0))
         corrections = None if last is None else last.corrections_of(intervals, len(planner.futures))
-        first_price = planner.first_price[len(self._aims.budgets) - budgets :]
-        price = first_price[: budgets if demand is None else None] if last is None else last.task.price
-        if self._common_outlook is not None:
-            price = self._price
+        price = demands.price
+        if price is None:
+            price = planner.first_price[: budgets if demand is None else None] if last is None else last.task.price
         is_redrawn = any(low < high for low, high in (part.ends for part in self._env.network.processes.disturbances))
         task = WindowTask(
             stock, intervals, demand, later, price, corrections, is_outlook, is_redrawn, demands.limits, demands.charges
