@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 from unittest.mock import patch
@@ -19,8 +20,10 @@ from cirl_marl.dynamics.arrivals import Arrivals
 from cirl_marl.dynamics.elimination import visits
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.dynamics.static_elimination import SparseRow, StaticElimination, contract_hubs, square_matrix
+from cirl_marl.dynamics.store_chains import StoreChains
 from cirl_marl.errors import NetworkError
 from cirl_marl.network import RowSum
+from cirl_marl.network.elements import Lifetime, Substance
 
 Floats = NDArray[np.float64]
 
@@ -351,3 +354,57 @@ def test_a_flow_that_is_cut_in_one_copy_leaves_the_others_as_they_are() -> None:
         lone.reset(seed=i, options={"initial_state": {"pot": held[i]}})
         np.testing.assert_array_equal(lone.advance(actions[:, i : i + 1]).flow[:, 0], flow[:, i])
         np.testing.assert_array_equal(lone.physical.stock[:, 0], stock[:, i])
+
+
+def chained(seed: int) -> Network:
+    """Return a network of two lifetimes in a ring of markets, of which agents stretch one or both, with a substance."""
+    rng = np.random.default_rng(seed)
+    stretch = Control(kind=ControlKind.STRETCH, low=0.5, neutral=1.0, high=2.0)
+    uses = [
+        Node(
+            id=f"use_{i}",
+            initial=(10.0, 50.0),
+            lifetime=Lifetime(mean=float(rng.uniform(4, 12)), deviation=float(rng.uniform(0.8, 3))),
+            control=stretch if i == 0 or rng.random() < 0.5 else None,
+            content=(("copper", 0.1),) if i else (),
+        )
+        for i in range(2)
+    ]
+    arcs = [Arc(id=f"made_{i}", donor="market", recipient=f"use_{i}", law=Law.SHARE) for i in range(2)]
+    arcs[0] = replace(arcs[0], control=Control(kind=ControlKind.SHARE, low=0.1, neutral=0.3, high=0.9))
+    arcs += [Arc(id=f"scrap_{i}", donor=f"use_{i}", recipient="scrap", law=Law.SHARE, share=1.0) for i in range(2)]
+    arcs += [Arc(id="melt", donor="scrap", recipient="market", rate=float(rng.uniform(0.1, 0.9)))]
+    arcs += [Arc(id="mined", donor="ore", recipient="market", law=Law.EXOGENOUS, flow=2.0)]
+    nodes = (
+        *uses,
+        Node(id="scrap", initial=(5.0, 5.0)),
+        Node(id="ore", role=Role.NONRENEWABLE_RESERVOIR),
+        Node(id="market", stores=False),
+    )
+    episode = Episode(horizon=8)
+    substances = (Substance(id="copper"),) if rng.random() < 0.5 else ()
+    if not substances:
+        nodes = tuple(replace(node, content=()) for node in nodes)
+    return Network(name="chained", nodes=nodes, arcs=tuple(arcs), episode=episode, substances=substances)
+
+
+@given(seed=st.integers(0, 2**31))
+@settings(max_examples=15)
+def test_chains_of_stores_change_no_bit(seed: int) -> None:
+    """What moves along stages whose rates an agent sets, without and with the sparse sum."""
+
+    def none(gives: Any, drivers: Any, flows: Any, first: int) -> StoreChains:
+        return StoreChains(gives, [], [], first)
+
+    network = chained(seed)
+    ours = played(network, seed)
+    dynamics = MultiAgentVectorEnv(network).dynamics
+    assert dynamics.taylor is not None and dynamics.taylor._shortcut is not None
+    lifetimes = [node.lifetime for node in network.stores if node.lifetime is not None and node.control is not None]
+    stages = [len(lifetime.chain.inflow_shares) for lifetime in lifetimes if lifetime.chain is not None]
+    expected = sum(count - 1 for count in stages) * (1 + len(network.substances))
+    assert len(dynamics.taylor._shortcut._chains.flows) == expected
+    with patch("cirl_marl.dynamics.taylor.StoreChains", none):
+        theirs = played(network, seed)
+    for one, other in zip(ours, theirs, strict=True):
+        np.testing.assert_array_equal(one, other)

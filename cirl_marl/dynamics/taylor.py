@@ -9,6 +9,7 @@ import numpy as np
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.dynamics.routing import IntervalRoutes, Routing
 from cirl_marl.dynamics.static_elimination import SparseRow, contract_hubs, square_matrix
+from cirl_marl.dynamics.store_chains import StoreChains
 from cirl_marl.network import Floats, Integers, RowSum
 from cirl_marl.network.elements import Law
 from cirl_marl.network.rowsum import spans
@@ -146,8 +147,7 @@ class KronReduction:
         routing, nodes, masses = laws.routing, laws.routing.nodes, laws.rows.masses
         outer = laws.staged_network.donors < laws.rows.nodes.stop
         place = {i: n for n, i in enumerate(routing.detours.kept_nodes)}
-        self._varying_flows = np.flatnonzero(outer & ~laws.is_fixed)
-        self._drivers = laws.driver[self._varying_flows]
+        varying_flows = np.flatnonzero(outer & ~laws.is_fixed)
         donors = routing.donors.tolist()
         varying_exits = [k for k, is_same in enumerate(routing.is_fixed) if donors[k] in place and not is_same]
         self._varying_arcs = routing.arcs[varying_exits]
@@ -158,22 +158,29 @@ class KronReduction:
         self._senders: Integers = row_of[np.array(senders, dtype=np.intp)]
 
         # nodes have the names that they have in ``detours``, and so has what stocks, the first of the masses, get
-        mass, flow, share, end = np.cumsum(
-            [nodes + masses, masses, len(self._varying_flows), len(varying_exits)]
-        ).tolist()
+        mass, flow, share, end = np.cumsum([nodes + masses, masses, len(varying_flows), len(varying_exits)]).tolist()
         rates = laws.rate(laws.neutral[:, :1])[:, 0]
-        inflow_rows = _inflow_rows(laws, rates, range(mass, flow), range(flow, share), self._varying_flows)
+        inflow_rows = _inflow_rows(laws, rates, range(mass, flow), range(flow, share), varying_flows)
         before = contract_hubs(inflow_rows, routing.detours.order)
+        drivers, all_flows = laws.driver[varying_flows], range(flow, share)
+        self._chains = StoreChains(inflow_rows, drivers.tolist(), all_flows, nodes)
+        self._chain_flows = varying_flows[self._chains.flows]
+        flow_names = [name for name in all_flows if name in inflow_rows]
+        remaining_flows = np.array(flow_names, dtype=np.intp) - flow
+        self._varying_flows, self._drivers = varying_flows[remaining_flows], drivers[remaining_flows]
         spread = _outflow_rows(routing, rates, range(share, end), varying_exits)
         after = contract_hubs(spread, routing.detours.order)
         inflows = [kept_nodes[i] for i in order]
-        names: list[Sequence[int]] = [range(mass, flow), range(flow, share), before, inflows, inflows[::-1], kept_nodes]
+        names: list[Sequence[int]] = [range(mass, flow), flow_names, before, inflows, inflows[::-1], kept_nodes]
         names += [range(share, end), after, range(nodes, nodes + masses)]
         parts = spans(map(len, names))
         self._masses, self._flows, hubs, kept_inflows, passed, kept_rows, self._varying_rows, _, self._change = parts
-        self._rest, size = slice(hubs.start, self._change.stop), self._change.stop
         self._passing = slice(kept_inflows.start, passed.stop)
         self._sent_rows = slice(kept_rows.start, self._varying_rows.stop)
+        size, first = self._change.stop, self._change.start
+        starts = [hubs.start, *(first + run.stop for run in self._chains.runs)]
+        stops = [*(first + run.start for run in self._chains.runs), size]
+        self._sums = [slice(start, stop) for start, stop in zip(starts, stops, strict=True)]
         rows = [
             dict(zip(columns, range(part.start, part.stop), strict=True))
             for columns, part in zip(names, parts, strict=True)
@@ -183,16 +190,19 @@ class KronReduction:
 
     def mean(self, stock: Floats, routes: IntervalRoutes, terms: int | None, rate: Floats) -> Floats:
         """Return the mean of the masses over the substep for constant ``rate``, shape (masses, B)."""
-        rates, shares = rate.take(self._varying_flows, 0), routes.rate.take(self._varying_arcs, 0)
+        rates, chain_rates = rate.take(self._varying_flows, 0), rate.take(self._chain_flows, 0)
+        shares, chain_flow = routes.rate.take(self._varying_arcs, 0), np.empty_like(chain_rates)
         work: Floats = np.empty((self._change.stop, stock.shape[1]))
         mean: Floats = work[self._masses]
         flows, passing, sent_rows = work[self._flows], work[self._passing], work[self._sent_rows]
-        varying_rows, change, rest = work[self._varying_rows], work[self._change], work[self._rest]
+        varying_rows, change, sums = work[self._varying_rows], work[self._change], [work[rows] for rows in self._sums]
         mean[...] = stock
         for factor in self._factors[-(terms or len(self._factors)) :]:
             mean.take(self._drivers, 0, out=flows, mode="clip")  # "raise" would copy
             flows *= rates
-            rest.fill(0.0)
+            for rows in sums:
+                rows.fill(0.0)
+            self._chains.set_changes(mean, chain_rates, chain_flow, change)
             self._inflow_matrix.substitute(work)
             routes.kept_nodes.pass_through(passing)
             passing.take(self._senders, 0, out=sent_rows, mode="clip")
