@@ -224,8 +224,8 @@ def test_the_rest_of_a_plan_stays_where_a_new_one_is_worse() -> None:
     outcome = control._planner.futures[0].carry_out(plan.task, idle)
     level = np.minimum(outcome.level, 1.0).mean(axis=0)
     worse = replace(plan, actions=idle, level=level, bookings=outcome.bookings, value=outcome.value)
-    assert (control._planner.better_of(worse, plan.actions).actions == plan.actions).all()
-    assert control._planner.better_of(plan, worse.actions) is plan
+    assert (control._planner.better_of(worse, [plan.actions]).actions == plan.actions).all()
+    assert control._planner.better_of(plan, [worse.actions]) is plan
 
 
 @pytest.mark.parametrize("changes", [True, False])

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from cirl_marl import (
     MPC,
+    Account,
     Arc,
     Control,
     ControlKind,
@@ -433,6 +434,20 @@ def test_mpc_plans_for_disturbed_contents_as_expected(futures: int | None) -> No
         if isinstance(controller, MPC):
             assert not controller.note
     assert (means[0] >= 0.97).all() and (means[1] < 0.85).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "options", [{}, {"horizon": 5}, {"futures": 2}, {"aim": "ore"}, {"at_most": {"ore": 24.0}}], ids=str
+)
+def test_mpc_delivers_what_is_demanded_of_disturbed_contents(options: dict[str, Any]) -> None:
+    """In every episode as much as is asked for, and no more of the product, whatever is booked and charged for."""
+    network = mine(disturbances={"noise": NOISE}, disturbed={PATHS[0]: DisturbanceEffect(by="noise")})
+    arcs = tuple(replace(arc, accounts={"ore": 1.0} if arc.id == "mined" else {}) for arc in network.arcs)
+    network = replace(network, arcs=arcs, accounts=(Account(id="ore", unit="EUR_2023"),))
+    run = rollout(MultiAgentVectorEnv(network, num_envs=2), MPC(min_service=0.75, **options), seed=0)
+    assert run.episode_levels.min() >= 0.75 - 2e-3
+    assert run.episode_levels[:, 0].max() <= 0.75 + 2e-3
 
 
 def test_present_contents_are_those_of_the_copies() -> None:

@@ -22,7 +22,7 @@ from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
-from cirl_marl.optimum.aims import Aims
+from cirl_marl.optimum.aims import Aims, RateTables
 from cirl_marl.optimum.bounds import Bound
 from cirl_marl.optimum.linearised import MOST_SLOPES, ActionPlan, Later, jacobians, slopes_of, step_program
 from cirl_marl.optimum.matrices import Layout
@@ -115,6 +115,9 @@ class Trials:
     demand: Annotated[Floats, "mean level of each service, 0 for none, shape (services,)"]
     first: Annotated[int, "interval of the network in which plans begin"] = 0
     later: Annotated[Later | None, "what is worth after them; None if nothing comes after"] = None
+    rates: Annotated[
+        tuple[RateTables, RateTables] | None, "of accounts, and of budgets, over the intervals; None: the network's"
+    ] = None
 
 
 def climb(
@@ -158,6 +161,7 @@ def climb(
             is_leap=is_leap,
             first=trials.first,
             later=trials.later,
+            rates=trials.rates,
         )
         corrected, gain = program, 0.0
         for _ in range(1 + CORRECTIONS):

@@ -178,6 +178,7 @@ def step_program(
     is_leap: bool = False,
     first: int = 0,
     later: Later | None = None,
+    rates: tuple[RateTables, RateTables] | None = None,
 ) -> StepProgram:
     """Return the program of the best change of the actions within a trust region, to first order.
 
@@ -199,14 +200,17 @@ def step_program(
             what is too impure then gets better as less is made, as it will once nothing is.
         first: interval of the network in which the plan begins.
         later: what comes after it.
+        rates: of the accounts that are weighed, and of the budgets, over its intervals; None: those of the network.
     """
     network, limits = plan.network, plan.aims.limits if limits is None else limits
     steps, entries = plan.actions.shape
     state, services, is_absolute = slopes[2], len(network.services), network.objective.net_zero == "abs"
     period = slice(first, first + steps)
     intervals = range(period.start, period.stop)
-    rates, rates_of_budgets = over(Ledger(network).rates(), intervals), over(plan.aims.rates(network), intervals)
-    efforts = _Efforts.of(plan, rates[2], first)
+    if rates is None:
+        rates = over(Ledger(network).rates(), intervals), over(plan.aims.rates(network), intervals)
+    rates_of_accounts, rates_of_budgets = rates
+    efforts = _Efforts.of(plan, rates_of_accounts[2], first)
     size = entries + services + 1 + len(efforts.entries)
     level, imbalance, count = entries, entries + services, size * steps + services + len(limits)
     step_low, step_high = np.maximum(-trust, -1 - plan.actions), np.minimum(trust, 1 - plan.actions)
@@ -215,13 +219,13 @@ def step_program(
     low *= 1.0 + margin
     measure, by_stage, imbalances = _measures(plan, dynamics)
     contents = _contents(plan, dynamics)
-    accounts = _account_shares(rates, dynamics)
+    accounts = _account_shares(rates_of_accounts, dynamics)
     weights = -plan.aims.objective(-_circularity_cost(plan, dynamics), accounts)
     cost, cost_later, spent = np.zeros(count), np.zeros(count), np.zeros((len(limits), count))
     budgets = _account_shares(rates_of_budgets, dynamics)
     columns = size * np.arange(steps)[:, None] + np.arange(size)
     effort = columns[:, imbalance + 1 :]
-    cost[effort] = -plan.aims.objective(np.zeros(effort.shape), rates[2][:, :, efforts.controls])
+    cost[effort] = -plan.aims.objective(np.zeros(effort.shape), rates_of_accounts[2][:, :, efforts.controls])
     spent[:, effort] = rates_of_budgets[2][:, :, efforts.controls]
     rows: list[sparse.csr_array] = []
     rights: list[Floats] = []

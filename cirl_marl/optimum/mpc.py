@@ -227,19 +227,12 @@ class MPC(Planner):
 
         Raises:
             NoCertificate: for a network whose flows are not linear laws; see ``bound``.
-            CirlError: for another number of demanded levels than services, and for budgets or another aim than λ̄ beside
-                services of contents.
+            CirlError: for another number of demanded levels than services.
         """
         network, (horizon, replan, futures) = env.network, self._options
         self._aims = aims = aims_of(network, self._aim, self._at_most)
         self._levels = None if self._min_service is None else demanded_levels(network, self._min_service)
-        has_contents = any(service.substance for service in network.services)
-        if has_contents and not (aims.is_circular and not aims.budgets):
-            raise CirlError(
-                f"network '{network.name}': beside services of contents MPC keeps no budgets and has no other aim than "
-                f"'{CIRCULARITY}'; leave out at_most and aim, or act by improve_plan(bound(...))"
-            )
-        self._climbs = has_contents and futures is None
+        self._climbs = any(service.substance for service in network.services)
         self.note, self._env, is_disturbed = "", env, bool(network.disturbed)
         if self._prices is not None and len(self._prices.service) > len(network.services):
             raise CirlError("prices: those of a bound with budgets, which no plan of one interval can keep")
@@ -269,6 +262,8 @@ class MPC(Planner):
             if self._levels is not None:
                 least = LEAST_PRICE * network.objective.circularity_scale
                 self._price = self._margin * np.maximum(multipliers, least)
+                if self._climbs:
+                    self._price = self._margin * outlook.task.price[len(aims.budgets) :]
         self._plans = []
         self._look_ahead(range(env.num_envs))
         for copy in range(env.num_envs):
@@ -332,8 +327,9 @@ class MPC(Planner):
             deficit = self._levels * steps - state.service[:, copy]
         if outlook is None:
             demands = _Demands(deficit, self._bookings.remainders(copy) / self._aims.sizes)
-        else:  # no level is demanded, all that lacks has its price
-            deficit = None if deficit is None else np.full(len(deficit), float(len(rest)))
+        else:
+            if deficit is not None and not self._climbs:  # no level is demanded, all that lacks has its price
+                deficit = np.full(len(deficit), float(len(rest)))
             demands = _Demands(deficit, charges=outlook.charges, price=self._price)
             if self._aims.has_years:
                 limits, share = self._bookings.limits(copy, window, outlook.bookings)
@@ -345,13 +341,15 @@ class MPC(Planner):
             plan = self._plan(copy, window, demands, last)
             if last is None or self._common_outlook is not None or not len(demands.limits):
                 return plan
-            return self._planner.better_of(plan, last.actions[window.start - last.task.intervals.start :])
+            return self._planner.better_of(plan, [last.actions[window.start - last.task.intervals.start :]])
         if outlook is None and copy not in self._outlooks:
             self._outlooks[copy] = self._plan(copy, rest, demands, None, is_outlook=True)
         outlook = outlook or self._outlooks[copy]
         if deficit is not None:
             after = window.stop - outlook.task.intervals.start
-            later_levels = outlook.levels[after:].sum(axis=0) if self._common_outlook is None else steps - window.stop
+            later_levels = outlook.levels[after:].sum(axis=0)
+            if self._common_outlook is not None and self._levels is not None:
+                later_levels = (self._levels if self._climbs else 1.0) * (steps - window.stop)
             demands = replace(demands, deficit=deficit - later_levels)
         later = outlook.continuation(window)
         if self._prices is not None:
@@ -422,15 +420,23 @@ class MPC(Planner):
             plan = self._climb(planner, plan, last)
         if is_outlook or self._drawn is not None:
             return plan
-        return planner.better_of(plan, np.tile(self._neutral_entries(copy), (len(intervals), 1)))
+        return planner.better_of(plan, [np.tile(self._neutral_entries(copy), (len(intervals), 1))])
 
     def _climb(self, planner: WindowPlanner, plan: WindowPlan, last: WindowPlan | None) -> WindowPlan:
-        """Return a plan in which contents count as they come about, from a plan or what is left of the one before."""
+        """Return a plan in which contents count as they come about, from a plan or what is left of the one before.
+
+        In each of several futures other actions may be best. Of what is best at first in one of them, and the mean of
+        these, that is done which does best in all.
+        """
         if last is not None:
             ahead = plan.task.intervals.start - last.task.intervals.start
             places = np.minimum(np.arange(ahead, ahead + len(plan.actions)), len(last.actions) - 1)
-            plan = planner.better_of(plan, last.actions[places])
-        return planner.better_of(plan, climb_window(planner.futures[0], plan.task, plan.actions, self._weight))
+            plan = planner.better_of(plan, [last.actions[places]] * len(planner.futures))
+        courses = [climb_window(future, plan.task, plan.actions, self._weight) for future in planner.futures]
+        firsts = [course[0] for course in courses]
+        for first in (*firsts, np.mean(firsts, axis=0))[: None if len(courses) > 1 else 1]:
+            plan = planner.better_of(plan, [np.concatenate([first[None], course[1:]]) for course in courses])
+        return plan
 
     def _neutral_entries(self, copy: int) -> Floats:
         """Return neutral actions of a copy, shape (entries,)."""

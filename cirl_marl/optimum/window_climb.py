@@ -13,7 +13,7 @@ import numpy as np
 
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
-from cirl_marl.optimum.aims import NO_AIMS, Aims
+from cirl_marl.optimum.aims import Aims
 from cirl_marl.optimum.improve import Trials, climb
 from cirl_marl.optimum.linearised import MOST_SLOPES, slopes_of
 from cirl_marl.optimum.window_planner import Future
@@ -32,7 +32,7 @@ class WindowActions:
     initial: Annotated[Floats, "stocks at the start, by stage, shape (rows,), mass"]
     actions: Annotated[Floats, "normalised, shape (intervals, entries)"]
     service_weight: Annotated[float | None, "of λ̄/scale + w·service"]
-    aims: Annotated[Aims, "λ̄ alone"] = NO_AIMS
+    aims: Annotated[Aims, "objective, as the part of the episode that these intervals are, and what is left of budgets"]
 
 
 @positional_record
@@ -43,8 +43,8 @@ class WindowEpisode:
     levels: Annotated[Floats, "shape (1, services, intervals)"]
     stock: Annotated[Floats, "shape (intervals, stores), mass"]
     flow: Annotated[Floats, "shape (intervals, arcs), mass/time"]
-    accounts: Annotated[Floats, "none, as no account counts"]
-    bookings: Annotated[Floats, "likewise"]
+    accounts: Annotated[Floats, "of these intervals, discounted, shape (1, accounts)"]
+    bookings: Annotated[Floats, "not discounted, in the intervals of the episode, shape (1, accounts, horizon)"]
 
     @property
     def episode_levels(self) -> Floats:
@@ -56,30 +56,35 @@ def climb_window(future: Future, task: WindowTask, actions: Floats, service_weig
     """Return better actions of a window, shape (intervals, entries).
 
     Args:
-        future: that is planned for, in which no account counts.
+        future: that is planned for.
         task: what is planned.
         actions: to begin with.
         service_weight: of the objective; None if services are demanded.
     """
-    share, no_accounts = len(task.intervals) / future.horizon, np.zeros((1, 0))
-    plan = WindowActions(future.network, future.admissible.agents, task.stock, actions, service_weight)
+    share, aims = len(task.intervals) / future.horizon, future.aims_of(task)
+    plan = WindowActions(future.network, future.admissible.agents, task.stock, actions, service_weight, aims)
     if slopes_of(plan, future.dynamics) > MOST_SLOPES:
         return actions
 
     def simulate(trial: WindowActions) -> WindowEpisode:
         outcome = future.carry_out(task, trial.actions)
         levels = np.minimum(outcome.level, 1.0).T[None]
-        return WindowEpisode(
-            outcome.value / share, levels, outcome.stock, outcome.flow, no_accounts, no_accounts[..., None]
-        )
+        bookings = np.zeros((1, len(outcome.amounts), future.horizon))
+        bookings[0, :, task.intervals.start : task.intervals.stop] = outcome.amounts
+        accounts = outcome.accounts[None]
+        return WindowEpisode(outcome.value / share, levels, outcome.stock, outcome.flow, accounts, bookings)
 
     def value(run: WindowEpisode, price: Floats) -> float:
-        return run.value - float(price @ np.maximum(0.0, demand - run.episode_levels[0]))
+        lacks = np.maximum(0.0, demand - run.episode_levels[0])
+        return run.value - float(price @ np.concatenate([lacks, aims.excess(run)]))
 
     demand = np.zeros(len(future.network.services)) if task.demand is None else task.demand
     later = future.later(task)
     if later is not None:
         later = replace(later, cost=later.cost / share, level_cost=later.level_cost / share)
-    trials = Trials(simulate, value, demand, future.places(task.intervals).start, later)
-    price = task.price if len(task.price) else np.zeros(len(demand))
+    first, rates = future.places(task.intervals).start, future.account_rates(task)
+    trials = Trials(simulate, value, demand, first, later, rates)
+    budgets = len(task.limits)
+    services = np.zeros(len(demand)) if task.demand is None else task.price[budgets:]
+    price = np.concatenate([services, task.price[:budgets] / (share * future.aims.sizes[:budgets])])
     return climb(plan, trials, price, ROUNDS).actions

@@ -80,6 +80,8 @@ class WindowOutcome:
         "of services, more than 1 where there is too much, or of a content with room, shape (intervals, services)",
     ]
     bookings: Annotated[Floats, "on budgeted accounts, in parts of budgets, shape (intervals, budgets)"]
+    amounts: Annotated[Floats, "on all accounts, not discounted, (accounts, intervals); empty if none counts"]
+    accounts: Annotated[Floats, "their totals, discounted, shape (accounts,)"]
     value: Annotated[float, "objective reached, less what is left to later intervals"]
     stock: Annotated[Floats, "after each interval, shape (intervals, stores), mass"]
     flow: Annotated[Floats, "mean of each interval, shape (intervals, arcs), mass/time"]
@@ -210,6 +212,30 @@ class Future:
         )
         return by_flow, by_stock, by_control
 
+    def aims_of(self, task: WindowTask) -> Aims:
+        """Return the aims of a task as those of an episode of its intervals; see ``account_rates``."""
+        share, aims, first = len(task.intervals) / self.horizon, self.aims, len(self.network.accounts)
+        charges = {account: charge / share for account, charge in aims.charges.items()}
+        prices = enumerate((task.charges / (aims.sizes * share)).tolist() if len(task.charges) else (), first)
+        amounts = zip(aims.budgets, (task.limits * aims.sizes).tolist(), strict=True) if len(task.limits) else ()
+        budgets = tuple(replace(budget, most=most) for budget, most in amounts)
+        return Aims(aims.circularity, charges | dict(prices), budgets)
+
+    def account_rates(self, task: WindowTask) -> tuple[RateTables, RateTables] | None:
+        """Return the rates of the accounts of ``aims_of`` over a task, and of its budgets; None if none counts.
+
+        What is charged for as it is booked stands after the accounts.
+        """
+        if self._ledger is None:
+            return None
+        by_account = self._rates(task.intervals, slice(None), self._discount)
+        by_budget = self._rates(task.intervals, self._budgets, self._counts)
+        none = by_budget[0][:0], by_budget[1][:0], by_budget[2][:0]
+        if len(task.charges):
+            flow, stock, control = (np.concatenate(pair) for pair in zip(by_account, by_budget, strict=True))
+            by_account = flow, stock, control
+        return by_account, by_budget if len(task.limits) else none
+
     def booking_rows(self, problem: Program, task: WindowTask) -> tuple[Any, Floats]:
         """Return rows of what is booked of budgets over the variables of a program, and what they have beside.
 
@@ -267,7 +293,8 @@ class Future:
         level = np.divide(quantity, low, out=np.ones_like(low), where=low > 0)
         if len(self._contents):
             level[:, self._contents] = self._content_levels(quantity, masses @ self._whole.T, intervals, most)
-        bookings, accounts = np.zeros((len(intervals), len(self._budgets))), np.zeros((0, len(intervals)))
+        bookings, amounts = np.zeros((len(intervals), len(self._budgets))), np.zeros((0, len(intervals)))
+        accounts = np.zeros(0)
         if self._ledger is not None:  # whose copies are the intervals here
             stores = self.dynamics.rows.stocks(np.append(stocks, np.ones((len(stocks), 1)), axis=1).T)
             deviation, agents = None, self.admissible.agents
@@ -277,12 +304,13 @@ class Future:
                 np.ascontiguousarray(flows.T), stores[:, :-1], stores[:, 1:], deviation, np.array(intervals)
             )
             amounts, period = self._ledger.sums(entries), slice(task.intervals.start, task.intervals.stop)
-            accounts = amounts * self._discount[:, period]
+            accounts = (amounts * self._discount[:, period]).sum(axis=1)
             bookings = (amounts[self._budgets] * self._counts[:, period] / self.aims.sizes[:, None]).T
-        value = self._value(task, flows_of_all, stocks[-1], np.minimum(level, 1.0), accounts.sum(axis=1))
+        value = self._value(task, flows_of_all, stocks[-1], np.minimum(level, 1.0), accounts)
         if len(task.charges):
             value -= float(task.charges @ bookings.sum(axis=0))
-        return WindowOutcome(level, bookings, value, self.dynamics.rows.stocks(stocks[1:].T).T, flows)
+        stock = self.dynamics.rows.stocks(stocks[1:].T).T
+        return WindowOutcome(level, bookings, amounts, accounts, value, stock, flows)
 
     def _content_levels(self, part: Floats, whole: Floats, intervals: range, most: Floats | None) -> Floats:
         """Return the levels of contents, shape (intervals, contents), of masses, shape (intervals, services)."""
@@ -469,11 +497,16 @@ class WindowPlanner:
         plan = WindowPlan(task, joint.problem, solution, trials[0].actions, corrections, *reached, merit=0.0)
         return replace(plan, merit=self._merit(plan, task.price))
 
-    def better_of(self, plan: WindowPlan, actions: Floats) -> WindowPlan:
-        """Return a plan, or in its place other actions of its intervals if they do better at the same prices."""
-        outcome = self.futures[0].carry_out(plan.task, actions)
-        level = np.minimum(outcome.level, 1.0).mean(axis=0)
-        other = replace(plan, actions=actions, level=level, bookings=outcome.bookings, value=outcome.value)
+    def better_of(self, plan: WindowPlan, actions: Sequence[Floats]) -> WindowPlan:
+        """Return a plan, or in its place other actions of its intervals if they do better at the same prices.
+
+        Actions are those in each future, shape (intervals, entries), the first of which are the same in all.
+        """
+        outcomes = [future.carry_out(plan.task, course) for future, course in zip(self.futures, actions, strict=True)]
+        level = np.mean([np.minimum(outcome.level, 1.0).mean(axis=0) for outcome in outcomes], axis=0)
+        bookings = np.mean([outcome.bookings for outcome in outcomes], axis=0)
+        value = float(np.mean([outcome.value for outcome in outcomes]))
+        other = replace(plan, actions=actions[0], level=level, bookings=bookings, value=value)
         merit = self._merit(other, plan.task.price)
         return replace(other, merit=merit) if merit > self._merit(plan, plan.task.price) else plan
 
