@@ -118,30 +118,30 @@ def _lemke(matrix: Floats, target: Floats) -> Floats:
     count = len(target)
     size, unit = 2 * count, np.eye(count)
     # columns: w and s, then v and y, what all rows are lent, and the values of what is basic
-    lent = 2 * size
-    table = np.zeros((size, lent + 2))
-    table[:, :size], table[:, lent], table[:, -1] = np.eye(size), -1.0, np.concatenate([-target, np.ones(count)])
-    table[:count, size:lent] = -np.concatenate([matrix, unit], axis=1)
+    loan = 2 * size
+    table = np.zeros((size, loan + 2))
+    table[:, :size], table[:, loan], table[:, -1] = np.eye(size), -1.0, np.concatenate([-target, np.ones(count)])
+    table[:count, size:loan] = -np.concatenate([matrix, unit], axis=1)
     table[count:, size : size + count] = unit
     # of rows that lack most the last, so that all are positive lexicographically
-    basis, entering, row = np.arange(size), lent, size - 1 - int(table[::-1, -1].argmin())
+    basis, pivot, row = np.arange(size), loan, size - 1 - int(table[::-1, -1].argmin())
     for _ in range(PIVOTS * size if table[row, -1] < 0 else 0):
-        leaving, basis[row] = basis[row], entering
-        table[row] /= table[row, entering]
-        others = np.arange(size) != row
-        table[others] -= table[others, entering, None] * table[row]
-        if leaving == lent:
+        former, basis[row] = basis[row], pivot
+        table[row] /= table[row, pivot]
+        remaining = np.arange(size) != row
+        table[remaining] -= table[remaining, pivot, None] * table[row]
+        if former == loan:
             break
-        entering = (leaving + size) % lent
-        column = table[:, entering]
+        pivot = (former + size) % loan
+        column = table[:, pivot]
         rows = np.flatnonzero(column > ROUNDING)
         if not len(rows):
             break
         # lexicographic, so that no basis comes twice; what was lent goes first
         ratios = table[rows][:, [-1, *range(size)]] / column[rows, None]
         nearest = rows[ratios[:, 0] <= ratios[:, 0].min() + ROUNDING]
-        is_lender = basis[nearest] == lent
+        is_lender = basis[nearest] == loan
         row = int(nearest[is_lender][0] if is_lender.any() else rows[np.lexsort(ratios.T[::-1])[0]])
-    values = np.zeros(lent + 1)
+    values = np.zeros(loan + 1)
     values[basis] = table[:, -1]
     return np.clip(values[size : size + count], 0.0, 1.0)

@@ -42,7 +42,7 @@ SECANTS, DIFFERENCE = 6, 1e-4
 LEVELS = ((2, 2e-2, 2), (6, 2e-5, 5), (None, 0.0, ROUNDS + 1))
 """Terms of the solver's series by which intervals are estimated; part of the demand below which what lacks will be
 little after one more correction; and most of these intervals. The last ones are simulated in full."""
-TOLD = 1e-6
+NOTABLE = 1e-6
 """Part of a demand that, if it lacks though it could be had, is told in a warning."""
 CELLS = 80_000
 """Most masses of all copies together that are worked on at once; more do not stay in a cache."""
@@ -84,7 +84,7 @@ class Supply:
         self.weights = np.array(weights).reshape(-1, 1)
         self.total = RowSum(self.of, np.arange(len(made_up)), 1.0, (len(services), len(made_up)))
         demand = [network.interval_means(service.low) for service in services]
-        self.services, self._warned = order, set[int]()
+        self.services, self._warnings = order, set[int]()
         self.demand = np.array(demand).reshape(len(services), network.episode.horizon)
         numbers = numbers_of(dynamics.factors.ranges, "services", "low")
         self.demand_factors = RowFactors(
@@ -229,20 +229,20 @@ class Supply:
                 if not open_.any():
                     break
         assert done is not None
-        if (gap > TOLD * demand).any():
+        if (gap > NOTABLE * demand).any():
             # where there is room, more would arrive, and no source has run out
-            room = np.where(shortage > 0, range_.most - supply, supply) > TOLD * range_.most
+            room = np.where(shortage > 0, range_.most - supply, supply) > NOTABLE * range_.most
             arrives = np.diagonal(slope, axis1=1, axis2=2).T > TINY * min(1.0, self._interval)
-            is_cut = done.moved_mass[self.indices] < (1.0 - TOLD) * self._interval * all_controls[self.rows]
+            is_cut = done.moved_mass[self.indices] < (1.0 - NOTABLE) * self._interval * all_controls[self.rows]
             could_move = room & arrives & (self.total(np.where(is_cut & idle, 1.0, 0.0)) == 0)
             self._warn(np.where(could_move, gap, 0.0), demand, step)
         return all_controls, done
 
     def _warn(self, gap: Floats, demand: Floats, step: Integers) -> None:
         """Warn, once for each service, that corrections ran out before supplies were what they should be."""
-        for row, copy in np.argwhere(gap > TOLD * demand).tolist():
-            if row not in self._warned:
-                self._warned.add(row)
+        for row, copy in np.argwhere(gap > NOTABLE * demand).tolist():
+            if row not in self._warnings:
+                self._warnings.add(row)
                 part = gap[row, copy] / demand[row, copy] if demand[row, copy] else np.inf
                 arcs = ", ".join(arc for arc, of in zip(self.arcs, self.of.tolist(), strict=True) if of == row)
                 warnings.warn(

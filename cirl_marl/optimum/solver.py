@@ -28,11 +28,11 @@ PRIMAL, DEVEX = 4, 1
 NO_PLAN = (highspy.HighsModelStatus.kInfeasible, highspy.HighsModelStatus.kUnboundedOrInfeasible)
 """As every variable is bounded, the latter means the former."""
 HighsOptions = Mapping[str, str | float]
-CLEANING = 2000
+CLEANUP_ITERATIONS = 2000
 """Simplex iterations after interior points. Where these stop short, HiGHS goes on by simplex, without end in programs
 of 25 000 variables; after a crossover it takes a few."""
 SETTINGS: tuple[HighsOptions, ...] = (
-    {"solver": "ipx", "simplex_iteration_limit": CLEANING},
+    {"solver": "ipx", "simplex_iteration_limit": CLEANUP_ITERATIONS},
     {"solver": "ipx", "run_crossover": "off"},
     {"solver": "ipx", "run_crossover": "off", "presolve": "off"},
     {"solver": "simplex", "presolve": "off"},

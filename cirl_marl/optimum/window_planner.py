@@ -230,11 +230,11 @@ class Future:
             return None
         by_account = self._rates(task.intervals, slice(None), self._discount)
         by_budget = self._rates(task.intervals, self._budgets, self._counts)
-        none = by_budget[0][:0], by_budget[1][:0], by_budget[2][:0]
+        no_budgets = by_budget[0][:0], by_budget[1][:0], by_budget[2][:0]
         if len(task.charges):
             flow, stock, control = (np.concatenate(pair) for pair in zip(by_account, by_budget, strict=True))
             by_account = flow, stock, control
-        return by_account, by_budget if len(task.limits) else none
+        return by_account, by_budget if len(task.limits) else no_budgets
 
     def booking_rows(self, problem: Program, task: WindowTask) -> tuple[Any, Floats]:
         """Return rows of what is booked of budgets over the variables of a program, and what they have beside.
