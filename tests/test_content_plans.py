@@ -41,6 +41,7 @@ from cirl_marl.network.series import Series
 from cirl_marl.network.substances import follows_contents
 from cirl_marl.network.uncertainty import Spread
 from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.aims import aims_of
 from cirl_marl.optimum.draw_proofs import Sampling
 from cirl_marl.optimum.linearised import jacobians, step_program
 from cirl_marl.optimum.options import by_stage, with_margin
@@ -305,6 +306,28 @@ def test_mpc_keeps_budgets_and_aims_beside_contents(options: dict[str, Any], ore
     np.testing.assert_allclose(run.accounts[0], [ore, scrap], atol=0.02)
     yearly = run.bookings[0, 1]
     assert yearly.max() <= 2.5 + 1e-3 or "scrap/year" not in options.get("at_most", {})
+
+
+def test_windows_weigh_accounts_as_the_simulator_does() -> None:
+    """What other actions change of the objective of a window is what its rates and charges say."""
+    network = booked()
+    ore = replace(network.accounts[0], discount=0.1)
+    network = replace(network, accounts=(ore, *network.accounts[1:]))
+    aims = aims_of(network, {"circularity": 1.0, "ore": 2.0}, {"scrap": 9.0, "scrap/year": 4.0})
+    future = Future(Admissible.of(network), 1, None, aims=aims)
+    stock, count = np.full(len(future.dynamics.rows.start_names), 50.0), len(aims.budgets)
+    for limits, charges in ((np.ones(count), np.zeros(0)), (np.zeros(0), np.arange(1.0, count + 1.0))):
+        task = WindowTask(stock, range(2, 5), None, None, np.ones(len(limits)), None, limits=limits, charges=charges)
+        actions = np.array([[0.1, -0.2], [0.3, 0.0], [-0.4, 0.5]])
+        one, other = (future.carry_out(task, sign * actions) for sign in (1.0, -1.0))
+        flow, rates = one.flow - other.flow, future.account_rates(task)
+        assert rates is not None
+        by_account, by_budget = (np.tensordot(table[0], flow) for table in rates)
+        circularity = float((flow @ network.circularity_weights.sum(axis=0)).mean())
+        expected = (one.value - other.value) * network.episode.horizon / len(actions)
+        assert future.aims_of(task).objective(circularity, by_account) == pytest.approx(expected, rel=1e-9)
+        if len(limits):
+            np.testing.assert_allclose(by_budget, (one.bookings - other.bookings).sum(axis=0) * aims.sizes, atol=1e-9)
 
 
 @pytest.mark.parametrize("horizon", [2, None])
