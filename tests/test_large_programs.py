@@ -229,6 +229,28 @@ def test_a_middling_program_leaves_its_basis_and_takes_a_plan_whose_multipliers_
     assert tried == [(solver.SETTINGS[1], None)]
 
 
+@pytest.mark.parametrize(("distance", "count"), [(0.5 * solver.FAIR, 3), (2.0 * solver.FAIR, 4)])
+def test_simplex_is_tried_where_interior_points_do_not_do(
+    monkeypatch: pytest.MonkeyPatch, distance: float, count: int
+) -> None:
+    """Nobody knows how long simplex takes from nothing; that after interior points ends after a number of steps."""
+    tried, run = list[Any](), solver._ScaledProgram.run
+    problem = bound("copper_net", min_service=0.9, degree=1, horizon=8).problem
+
+    def noted(scaled: Any, options: solver.HighsOptions | None, start: Any, **others: Any) -> Any:
+        tried.append(options)
+        highs = run(scaled, options, start, **others)
+        if len(tried) == 1:
+            limit = highs.getOptionValue("simplex_iteration_limit")[1]
+            assert options is not None and options["solver"] == "ipx" and limit < solver.LARGE_PROGRAM
+        return highs
+
+    monkeypatch.setattr(solver._ScaledProgram, "run", noted)
+    monkeypatch.setattr(solver._ScaledProgram, "distance", lambda *_: distance)
+    solver.solve(problem)
+    assert tried == [*solver.SETTINGS][:count]
+
+
 def test_without_hipo_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     """The other interior points are tried for an hour; an error then names the extra."""
     hurried = ({**solver.LARGE_SETTINGS[0]}, {**solver.LARGE_SETTINGS[1], "time_limit": 0.0})
