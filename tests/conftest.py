@@ -281,12 +281,13 @@ def with_changing_contents(network: Network, seed: int) -> Network:
 
     def changing(begin: float, end: float) -> dict[str, Series]:
         times = tuple(np.linspace(begin, end, 4).tolist())
+        share = 0.98 / len(names)  # one may step while another already grows towards the next time
         table = rng.dirichlet([1.0] * (len(names) + 1), 4)[:, 1:] * rng.integers(2, size=(4, 1))
         kinds = [str(rng.choice(["step", "linear"])) for _ in names]
         table[0] = 0.6 / len(names)
         return {
             name: Series(times=times, values=tuple(column.tolist()), interpolation=kind)
-            for name, column, kind in zip(names, table.T * 0.7, kinds, strict=True)
+            for name, column, kind in zip(names, table.T * share, kinds, strict=True)
         }
 
     nodes = [
