@@ -241,7 +241,7 @@ def test_simplex_is_tried_where_interior_points_do_not_do(
         tried.append(options)
         highs = run(scaled, options, start, **others)
         if len(tried) == 1:
-            limit = highs.getOptionValue("simplex_iteration_limit")[1]
+            limit = float(highs.getOptionValue("simplex_iteration_limit")[1])
             assert options is not None and options["solver"] == "ipx" and limit < solver.LARGE_PROGRAM
         return highs
 
