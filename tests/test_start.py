@@ -20,6 +20,7 @@ from cirl_marl.learners.interface import Trained, prepare, resume, train
 from cirl_marl.learners.learner import Learner, load_acting_learner
 from cirl_marl.learners.recipe import Recipe, load_recipe
 from cirl_marl.learners.run_directory import RunDirectory
+from cirl_marl.learners.start import _other_settings
 from cirl_marl.learners.trainer import Training
 
 AGENTS = ["mine", "use"]
@@ -284,6 +285,16 @@ def test_starts_that_do_not_fit_are_named(
     assert str(raised.value).startswith("agent 'mine': start: ")
     assert message.format(run=source, parent=source.parent) in str(raised.value)
     assert before == {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+
+
+def test_normalisers_of_runs_that_did_not_normalise_may_differ() -> None:
+    """Where observations are not normalised neither ε nor their limits count; where they are both do."""
+    for observation, count in ((False, 0), (True, 2)):
+        settings = [
+            recipe(normalise={"observation": observation, "epsilon": epsilon, "clip_observation": clip}).learner
+            for epsilon, clip in ((1e-8, 10.0), (1e-3, 5.0))
+        ]
+        assert len([*_other_settings(*settings)]) == count
 
 
 def test_one_recipe_serves_several_seeds(first: tuple[Training, Path], tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from cirl_marl import (
     Service,
 )
 from cirl_marl.dynamics import supply
-from cirl_marl.dynamics.complementarity import complementary
+from cirl_marl.dynamics.complementarity import _complementary_pivots, complementary
 from cirl_marl.network import Network
 from cirl_marl.network.elements import Lifetime
 
@@ -129,6 +129,26 @@ def test_supplies_solve_every_linear_problem(seed: int) -> None:
     lack, scale = shortage - slope @ (found - now), abs(shortage) + slope @ most
     assert (lack[found < most * (1 - 1e-12)] <= 1e-9 * scale[found < most * (1 - 1e-12)]).all()
     assert (lack[found > most * 1e-12] >= -1e-9 * scale[found > most * 1e-12]).all()
+
+
+@pytest.mark.parametrize("seed", [303, 795, 2362, 3801, 3967, 4254, 10771])
+def test_pivots_solve_problems_in_which_ratios_tie(seed: int) -> None:
+    """Whole numbers make equal rows and ratios, and equations of which some follow from others."""
+    rng = np.random.default_rng(seed)
+    size = int(rng.integers(2, 9))
+    if seed % 2:
+        slope = rng.integers(0, 4, (size, size)) + np.eye(size) * rng.integers(0, 2)
+    else:
+        slope = rng.uniform(0, 1, (size, size)) * (rng.random((size, size)) < rng.uniform(0.3, 1))
+        slope += 1e-3 * np.eye(size)
+    np.fill_diagonal(slope, np.maximum(np.diag(slope), 1e-3))
+    most = rng.choice([0.0, 1.0, 2.0, 10.0], size)
+    now = rng.integers(0, 3, size) / 2 * most
+    shortage = rng.integers(-4, 5, size) * (1.0 if seed % 2 else slope.sum(axis=1))
+    found = _complementary_pivots(slope, shortage, now, most, np.ones(size, dtype=bool))
+    lack = (shortage - slope @ (found - now)) / (np.abs(shortage) + slope @ most + 1e-9)
+    assert ((found >= 0) & (found <= most)).all()
+    assert (lack[found < most] < 1e-12).all() and (lack[found > 0] > -1e-12).all()
 
 
 def test_where_corrections_run_out_a_warning_says_so_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,8 +14,10 @@ TINY = 1e-9
 """Part of a supply that arrives in an interval, below which it is taken for none."""
 CHANGES, PIVOTS = 30, 10
 """Most changes of which supplies are at their bounds, and complementary pivots for each of these bounds."""
-ROUNDING = 1e-12
-"""What is taken for 0 in pivots."""
+DIGITS, ROUNDING = 10, 1e-12
+"""Of ratios of pivots, which are compared, and what is taken for 0 in them."""
+AT_BOUND = 1e-10
+"""Part of the most within which what pivots lead to is at its bound."""
 
 
 def complementary(slope: Floats, shortage: Floats, supply: Floats, most: Floats, interval: float) -> Floats:
@@ -95,10 +97,7 @@ def _complementary_pivots(slope: Floats, shortage: Floats, supply: Floats, most:
     # of parts of the most, and relative to what is measured, so that pivots compare what can be compared
     scale = np.abs(target) + np.abs(matrix) @ high
     part = _lemke(matrix * high / scale[:, None], target / scale)
-    is_free = (part > ROUNDING) & (part < 1.0 - ROUNDING)
-    values = np.where(is_free, target, np.where(part > 0.5, high, 0.0))
-    exact = _solve(np.where(is_free[:, None], matrix, np.eye(len(part)))[None], values[None])[0]
-    solution[places] = np.clip(np.where(np.isfinite(exact), exact, part * high), 0.0, high)
+    solution[places] = np.where(np.abs(part - part.round()) < AT_BOUND, part.round(), part) * high
     return solution
 
 
@@ -137,11 +136,8 @@ def _lemke(matrix: Floats, target: Floats) -> Floats:
         rows = np.flatnonzero(column > ROUNDING)
         if not len(rows):
             break
-        # lexicographic, so that no basis comes twice; what was lent goes first
         ratios = table[rows][:, [-1, *range(size)]] / column[rows, None]
-        nearest = rows[ratios[:, 0] <= ratios[:, 0].min() + ROUNDING]
-        is_lender = basis[nearest] == loan
-        row = int(nearest[is_lender][0] if is_lender.any() else rows[np.lexsort(ratios.T[::-1])[0]])
+        row = int(rows[np.lexsort(ratios.round(DIGITS).T[::-1])[0]])  # so that no basis comes twice
     values = np.zeros(loan + 1)
     values[basis] = table[:, -1]
     return np.clip(values[size : size + count], 0.0, 1.0)
