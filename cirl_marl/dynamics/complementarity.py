@@ -123,7 +123,7 @@ def _lemke(matrix: Floats, target: Floats) -> Floats:
     table[:count, size:loan] = -np.concatenate([matrix, unit], axis=1)
     table[count:, size : size + count] = unit
     # of rows that lack most the last, so that all are positive lexicographically
-    basis, pivot, row = np.arange(size), loan, size - 1 - int(table[::-1, -1].argmin())
+    basis, pivot, row = np.arange(size), loan, size - 1 - int(table[::-1, -1].round(DIGITS).argmin())
     for _ in range(PIVOTS * size if table[row, -1] < 0 else 0):
         former, basis[row] = basis[row], pivot
         table[row] /= table[row, pivot]
