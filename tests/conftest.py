@@ -281,7 +281,7 @@ def with_changing_contents(network: Network, seed: int) -> Network:
 
     def changing(begin: float, end: float) -> dict[str, Series]:
         times = tuple(np.linspace(begin, end, 4).tolist())
-        share = 0.98 / len(names)  # one may step while another already grows towards the next time
+        share = 0.7 / len(names)  # one may step while another grows, and tests draw and disturb them by up to 1.37
         table = rng.dirichlet([1.0] * (len(names) + 1), 4)[:, 1:] * rng.integers(2, size=(4, 1))
         kinds = [str(rng.choice(["step", "linear"])) for _ in names]
         table[0] = 0.6 / len(names)
