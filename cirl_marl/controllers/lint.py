@@ -22,8 +22,11 @@ from cirl_marl.network.series import Series, extremes
 from cirl_marl.network.substances import separated_substances
 from cirl_marl.network.units import factor
 from cirl_marl.network.validation.settings import is_whole
-from cirl_marl.network.validation.stocks import OWN_DEMANDS
 
+OWN_DEMANDS = (
+    "for products with demands of their own let it share out what is recycled, and primary material enter behind it, "
+    "by an arc for each that makes up for its service (docs/yearly_networks.md)"
+)
 COARSE = 0.01
 """Share of its largest value by which a state may depend on the step of the solver."""
 
@@ -205,7 +208,7 @@ def _markets(network: Network) -> Iterator[str]:
         orders = [arc for arc in exits if arc.law is Law.CONTROLLED]
         if node.role is Role.TECHNOSPHERE and node.id in recipients and orders == exits and len(exits) > 1:
             reason = f"a stock from which {', '.join(arc.id for arc in exits)} take what they ask for"
-            yield f"node '{node.id}': {reason}; if it is a market: stores = false, and {OWN_DEMANDS}"
+            yield f"node '{node.id}': {reason}; if it is a market: stores = false, and a share for the rest"
 
 
 def _short_flows(env: MultiAgentVectorEnv, neutral: Callable[[], Rollout]) -> Iterator[str]:
@@ -237,8 +240,12 @@ def _short_flows(env: MultiAgentVectorEnv, neutral: Callable[[], Rollout]) -> It
             arc, since = short.arc, f"from {short.begins:g} {network.time_unit} on"
             if arc.id in looked_at - reported:
                 reported.add(arc.id)
-                little = f"under {control} control '{arc.donor}' holds too little for its flow {since}"
-                yield f"arc '{arc.id}': {little}; give it a larger initial stock if it stands for the world outside"
+                stores = network.nodes[network.node_index[arc.donor]].stores
+                verb, remedy = "gets", "let more enter it, or order less"
+                if stores:
+                    verb, remedy = "holds", "give it a larger initial stock if it stands for the world outside"
+                little = f"under {control} control '{arc.donor}' {verb} too little for its flow {since}"
+                yield f"arc '{arc.id}': {little}; {remedy}"
 
 
 def _short_services(env: MultiAgentVectorEnv, neutral: Callable[[], Rollout]) -> Iterator[str]:

@@ -251,6 +251,8 @@ def _nonlinear(network: Network, agents: Sequence[str]) -> Iterator[str]:
     for arc in network.arcs:
         if reason := reasons.get(arc.law, ""):
             yield f"{reason} '{arc.id}'"
+    if network.orders:
+        yield f"orders from nodes that store nothing, '{network.arcs[network.orders[0]].id}' for one, may be cut"
     if network.time_dependent:
         yield f"numbers change in time: {', '.join(network.time_dependent)}"
 

@@ -73,7 +73,8 @@ def shortages(run: Rollout, network: Network) -> Iterator[Shortage]:
             arc, begins = network.arcs[k], float(np.argmax(lack > 0)) * interval
             less = f"{mass:.4g} {network.mass_unit} ({mass / order:.1%}) less than asked for"
             first = f"first at {begins:g} {network.time_unit}"
-            yield Shortage(arc, begins, mass, f"arc '{arc.id}' moved {less}, {first}: '{arc.donor}' held too little")
+            verb = "held" if network.nodes[network.node_index[arc.donor]].stores else "got"
+            yield Shortage(arc, begins, mass, f"arc '{arc.id}' moved {less}, {first}: '{arc.donor}' {verb} too little")
 
 
 def service_shortages(run: Rollout, network: Network) -> Iterator[str]:

@@ -9,6 +9,7 @@ from typing import Annotated
 import numpy as np
 
 from cirl_marl.controllers.basic import Arrays, Controller, Planner
+from cirl_marl.dynamics.laws import LAWS
 from cirl_marl.environments.present import PresentEnv
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import whole_number
@@ -137,7 +138,7 @@ def rollout(
     load, inner = np.empty((steps, len(batches.lines))), np.empty((steps, len(physics.visible)))
     total_flow, places = np.zeros(len(env.network.arcs)), len(env.network.compartments)
     contents = np.zeros((steps, len(env.network.substances), places))
-    orders = np.flatnonzero(env.dynamics.is_scheduled[: len(total_flow)])
+    orders = np.flatnonzero([LAWS[arc.law].is_scheduled for arc in env.network.arcs])
     controls = np.empty((steps, len(env.dynamics.neutral)))
     shortage = np.zeros((steps, len(orders)))
     for t in range(steps):

@@ -14,11 +14,14 @@ Where a function has a kink the derivative is one-sided: of a flow that just nee
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Annotated
 
 import numpy as np
 
 from cirl_marl.dynamics.integrator import Dynamics
+from cirl_marl.dynamics.krylov import conjugate_residuals
 from cirl_marl.dynamics.rate_adjoint import RateAdjoint
 from cirl_marl.dynamics.routing import IntervalRoutes
 from cirl_marl.dynamics.taylor import Taylor
@@ -27,6 +30,9 @@ from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Law
 from cirl_marl.network.rowsum import RowSum
+
+Sweep = Callable[[Floats, Floats], tuple[Floats, Floats]]
+"""``(stock, moved) → (stock, rates)``: adjoints after an interval become those before it."""
 
 
 @positional_record
@@ -84,9 +90,12 @@ class Adjoint:
         asked_rate = rate = dynamics.rate(inputs.controls, step, inputs.factors)
         if dynamics.capacities:
             dynamics.capacities.cut(rate := rate.copy(), stock, step, inputs.factors)
-        ordered_rate = rate
+        ordered_rate, through = rate, None
         if dynamics.source_contents:
             dynamics.source_contents.share_out(rate := rate.copy(), step, inputs.factors)
+        if dynamics.orders:
+            inner = np.empty((0, stock.shape[1]))
+            rate, through, _ = dynamics.hold_with_orders(stock, inner, inputs.controls, rate, step)
         if dynamics.slots is not None:
             stock = dynamics.slots.shift_slots(stock)
             dynamics.slots.set_outflows(stock, rate)
@@ -96,13 +105,11 @@ class Adjoint:
             drivers = self._drivers(stock, realised_rate, routes)
             trace.append((stock, realised_rate, drivers))
             stock = self._after(stock, realised_rate, drivers[-1])
-        rate_adjoint, moved = np.zeros_like(rate), dynamics.of_arcs_adjoint(moved_adjoint, substances_adjoint)
-        stock_adjoint[dynamics.rows.unit] = 0.0
-        for stock, realised_rate, drivers in reversed(trace):
-            adjoint = np.zeros_like(rate)
-            stock_adjoint = self._substep(realised_rate, drivers, routes, stock_adjoint, moved, adjoint)
-            dynamics.scheduled.pull_back(stock, rate, adjoint, stock_adjoint)
-            rate_adjoint += adjoint
+        sweep = partial(self._sweep, trace, rate, routes)
+        moved = dynamics.of_arcs_adjoint(moved_adjoint, substances_adjoint)
+        stock_adjoint, rate_adjoint = sweep(stock_adjoint, moved)
+        if through is not None:
+            stock_adjoint, rate_adjoint = self._of_orders(ordered_rate, through, sweep, stock_adjoint, rate_adjoint)
         if dynamics.slots is not None:
             stock_adjoint = dynamics.slots.pull_back(stock_adjoint, rate_adjoint)
         by_limits = None if inputs.factors is None else np.zeros_like(inputs.factors)
@@ -116,6 +123,44 @@ class Adjoint:
         if by_limits is not None and by_factors is not None:
             by_factors += by_limits
         return IntervalInputs(stock_adjoint, by_controls, by_factors)
+
+    def _sweep(
+        self,
+        trace: Sequence[tuple[Floats, Floats, list[Floats]]],
+        rate: Floats,
+        routes: IntervalRoutes | None,
+        stock_adjoint: Floats,
+        moved_adjoint: Floats,
+    ) -> tuple[Floats, Floats]:
+        """Return the adjoints of the masses before an interval and of its rates; ``trace`` is of its substeps."""
+        dynamics, rate_adjoint = self.dynamics, np.zeros_like(rate)
+        stock_adjoint[dynamics.rows.unit] = 0.0
+        for stock, realised_rate, drivers in reversed(trace):
+            adjoint = np.zeros_like(rate)
+            stock_adjoint = self._substep(realised_rate, drivers, routes, stock_adjoint, moved_adjoint, adjoint)
+            dynamics.scheduled.pull_back(stock, rate, adjoint, stock_adjoint)
+            rate_adjoint += adjoint
+        return stock_adjoint, rate_adjoint
+
+    def _of_orders(
+        self, rate: Floats, through: Floats, sweep: Sweep, stock_adjoint: Floats, rate_adjoint: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return the adjoints of masses and of rates with orders, of those with shares of what passes markets, q.
+
+        q = Q(q, …) is what shares of q lead to: a functional L changes by it as L + λᵀ Q, (I − ∂Q/∂q)ᵀ λ = ∂L/∂q.
+        """
+        orders, interval = self.dynamics.orders, self.dynamics.network.episode.control_interval
+
+        def respond(direction: Floats) -> tuple[Floats, Floats]:
+            by_stock, by_rate = sweep(np.zeros_like(stock_adjoint), orders.worth_of_moved(direction / interval))
+            return direction - orders.pull_back(rate, through, by_rate)[1], -np.concatenate([by_stock, by_rate])
+
+        residual = orders.pull_back(rate, through, rate_adjoint)[1]
+        total = conjugate_residuals(residual, np.concatenate([stock_adjoint, rate_adjoint]), respond)
+        if total is None:
+            raise CirlError(f"network '{self.dynamics.network.name}': how orders answer each other has no derivative")
+        stock_adjoint, rate_adjoint = np.split(total, [len(stock_adjoint)])
+        return stock_adjoint, orders.pull_back(rate, through, rate_adjoint)[0]
 
     def _drivers(self, stock: Floats, rate: Floats, routes: IntervalRoutes | None) -> list[Floats]:
         """Return what drives the arcs in each term of the series, from the innermost to the mean of the substep."""

@@ -26,6 +26,9 @@ from cirl_marl.network.series import Series
 Transfer = Callable[..., Floats]
 """``(rate, settled) → moved``: mass that a substep moves along each arc; flows in ``settled`` hold, but for NaN."""
 
+Held = tuple[Floats, Floats, Floats, Floats, Floats | None]
+"""Stocks, inner states, the mass moved, the last rates and what batches do in an interval."""
+
 RUNGE_KUTTA = {"rk4": ((0.0, 0.5, 0.5, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6)), "euler": ((0.0,), (1.0,))}
 """Nodes and weights of the explicit schemes; each stage starts from the slope of the one before."""
 
@@ -114,8 +117,12 @@ class Dynamics(FlowLaws):
             )
         rate = self.rate(controls, step, factors) if rate is None else rate
         self._limit(rate, stock, step, factors)
-        routes = routes or self.routing.routes(rate)
-        stock, inner, total, rate, batch_mass = self._hold(stock, inner, controls, rate, routes, step, None)
+        if self.orders:
+            _, _, (stock, inner, total, rate, batch_mass) = self.hold_with_orders(stock, inner, controls, rate, step)
+            routes = self.routing.routes(rate)
+        else:
+            routes = routes or self.routing.routes(rate)
+            stock, inner, total, rate, batch_mass = self._hold(stock, inner, controls, rate, routes, step, None)
         self._check_finite(stock, inner)
         flow, _ = self.of_arcs(self._flow_at(stock, inner, controls, rate, routes))
         return Transition(stock, inner, *self.of_arcs(total), flow, batch_mass)
@@ -152,8 +159,8 @@ class Dynamics(FlowLaws):
         routes: IntervalRoutes | None,
         step: Integers | None,
         terms: int | None,
-    ) -> tuple[Floats, Floats, Floats, Floats, Floats | None]:
-        """Go through an interval; return stocks, inner states, the mass moved, the last rates and what batches do."""
+    ) -> Held:
+        """Go through an interval."""
         if self.slots is not None:
             stock = self.slots.shift_slots(stock)
             self.slots.set_outflows(stock, rate)
@@ -180,6 +187,35 @@ class Dynamics(FlowLaws):
             total[self.batches.arcs] = deliveries
             batch_mass = np.stack([batch_start, batch_end])
         return stock, inner, total, actual_rate, batch_mass
+
+    def hold_with_orders(
+        self, stock: Floats, inner: Floats, controls: Floats, rate: Floats, step: Integers | None
+    ) -> tuple[Floats, Floats, Held]:
+        """Go through an interval in which orders are shares of what passes markets, q.
+
+        Returns:
+            rates with these shares, shape (arcs, B), q, shape (markets, B), and what ``_hold`` returns.
+        """
+        interval, copies = self.network.episode.control_interval, stock.shape[1]
+        steps = None if step is None else np.broadcast_to(step, copies)
+        done: list[Held] = []
+
+        def simulate(columns: Integers, shares: Floats) -> Floats:
+            masses, states, settings = (array.take(columns, axis=1) for array in (stock, inner, controls))
+            routes, at = self.routing.routes(shares), None if steps is None else steps[columns]
+            part = self._hold(masses, states, settings, shares, routes, at, None)
+            if not done:
+                done.append(part)
+            else:
+                for whole, some in zip(done[0][:4], part[:4], strict=True):
+                    whole[:, columns] = some
+            return part[2] / interval
+
+        try:
+            rate, through = self.orders.settle(rate, self.flow(stock, rate), simulate)
+        except ArithmeticError as error:
+            raise CirlError(f"network '{self.network.name}': {error}") from error
+        return rate, through, done[0]
 
     def of_arcs(self, flow: Floats) -> tuple[Floats, Floats]:
         """Return what the arcs of the network carry, of all that is moved, shape (arcs of the simulator, B).
@@ -249,6 +285,10 @@ class Dynamics(FlowLaws):
             self.slots.set_outflows(stock, rate)
         if self.physical:
             rate = self.scheduled.cut(stock, rate)
+        if self.orders:
+            entry_flow = self.flow(stock, rate)
+            through = self.orders.clear(rate, entry_flow, np.zeros((len(self.orders.markets), stock.shape[1])))
+            rate = self.orders.shares(rate, through)
         routes = self.routing.routes(rate)
         flow = self._flow_at(stock, inner, controls, rate, routes)
         if not self._heedless:

@@ -20,6 +20,7 @@ from typing import Annotated
 import numpy as np
 
 from cirl_marl.dynamics.components import simulated_network
+from cirl_marl.dynamics.orders import Orders
 from cirl_marl.dynamics.routing import Routing
 from cirl_marl.dynamics.shares import Shares
 from cirl_marl.dynamics.source_contents import SourceContents
@@ -79,7 +80,7 @@ class ArcRates:
         staged_network: whose arcs they are, with lifetimes as stages.
         rows: which row of the masses is what.
         driver: row of the extended stocks that drives each arc, shape (arcs,).
-        is_scheduled: arcs that flow by schedule, shape (arcs,).
+        is_scheduled: arcs that flow by schedule out of stocks, shape (arcs,).
         control_low: lower bounds of the controls in each interval, in the rows of ``network.control_rows``, shape
             (controls, horizon).
         control_high: upper bounds.
@@ -97,6 +98,7 @@ class ArcRates:
         self.rows = rows = StateLayout(network)
         laws = [LAWS[arc.law] for arc in network.arcs]
         self.is_scheduled = np.array([law.is_scheduled for law in laws], dtype=bool)
+        self.is_scheduled[[*network.orders]] = False
         drivers = [law.driver(arc, network, rows) for law, arc in zip(laws, network.arcs, strict=True)]
         self.driver: Integers = np.array(drivers, dtype=np.intp)
         base = [law.coefficient(arc, network) for law, arc in zip(laws, network.arcs, strict=True)]
@@ -226,6 +228,7 @@ class FlowLaws(ArcRates):
         time_dependent: arcs whose r depends on the interval, by id.
         is_fixed: arcs whose r is the same in all copies and intervals, shape (arcs,).
         routing: what passes through nodes that store nothing.
+        orders: flows out of these that are asked for.
         control_factors: which controls are as they were drawn.
         source_contents: what sources give whose contents change; not in ``rate``, which is of orders.
     """
@@ -245,18 +248,22 @@ class FlowLaws(ArcRates):
         self.incidence = RowSum(ends[has_stock], arcs_twice[has_stock], signs[has_stock], (rows.masses, arcs))
         self.shares = Shares(staged_network, ranges)
         self.max_rate[self.shares.arcs] *= self.shares.highest
+        self.max_rate[[*staged_network.orders]] = 1.0
         self.source_contents = SourceContents(network, staged_network, ranges)
         time_arcs = [*self._series_arcs, *(self.shares.varying_arcs if self.shares.is_time_varying else ())]
         time_arcs += self.source_contents.arcs[0].tolist() if self.source_contents.varies else []
         self.time_dependent = tuple(staged_network.arcs[k].id for k in time_arcs)
         self._share_out()
         self.routing = Routing(staged_network, self.rate(self.neutral[:, :1]), self.is_fixed, ranges)
+        self.orders = Orders(staged_network, self.routing)
 
     def _share_out(self) -> None:
         """Multiply constant shares into r, where no control comes before them, and find out which r never change."""
         shares = self.shares
         self.is_fixed = ~self.is_scheduled
         self.is_fixed[self.controlled_arcs] = False
+        donors = self.staged_network.donors
+        self.is_fixed[np.isin(donors, donors[[*self.staged_network.orders]])] = False
         once = ~np.isin(shares.constant_arcs, self.controlled_arcs)
         self._base[shares.constant_arcs[once]] *= shares.values[once]
         self._constant_shares = shares.constant_arcs[~once], shares.values[~once]

@@ -46,7 +46,8 @@ class Shares:
     def __init__(self, network: Network, ranges: Mapping[str, tuple[float, float]]) -> None:
         """Compile the splits of ``network``; those of which a share is in ``ranges``, of factors, vary."""
         number_of = _numbers_of_shares(network, ranges)
-        all_splits = network.splits
+        # orders take what they take before the others share what is left
+        all_splits = [split.without(network.orders) for split in network.splits]
         tables = [(single_column(split.bounds), single_column(split.proportions)) for split in all_splits]
         self.is_time_varying = any(table.shape[-1] > 1 for pair in tables for table in pair)
         columns = network.episode.horizon if self.is_time_varying else 1

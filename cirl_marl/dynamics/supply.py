@@ -187,9 +187,9 @@ class Supply:
         change, slope = np.zeros_like(supply), np.zeros((batch, len(demand), len(demand)))
         all_controls[self.rows] = 1.0
         unit_rate = dynamics.rate(all_controls, step, factors)
-        routes = dynamics.routing.routes(unit_rate)
+        routes = dynamics.routing.routes(dynamics.orders.further_shares(unit_rate))
         arrivals = self.arrivals(routes)
-        for terms, accuracy, rounds in LEVELS if dynamics.taylor is not None else LEVELS[-1:]:
+        for terms, accuracy, rounds in LEVELS if dynamics.taylor is not None and not dynamics.orders else LEVELS[-1:]:
             open_ = np.ones(batch, dtype=bool)
             for correction in range(rounds):
                 extent = range_.extents(supply)[self.of]

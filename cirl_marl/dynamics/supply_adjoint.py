@@ -2,9 +2,9 @@
 
 Where a supply lies between its bounds, what its service measures stays at what is demanded, q_s(v, …) = D_s, whatever
 else changes. By the implicit function theorem a functional L then changes as L − Σ_s μ_s(q_s − D_s) does, with
-(∂q/∂v)ᵀ μ = ∂L/∂v for the extents v of such supplies. μ is found by conjugate residuals (GCR, Eisenstat, Elman and
-Schultz 1983): every direction that is tried is one more interval backwards, whose derivatives count with it. What
-arrives at once (``Arrivals``) preconditions them, so that a few directions are enough for many services.
+(∂q/∂v)ᵀ μ = ∂L/∂v for the extents v of such supplies. μ is found by conjugate residuals: every direction that is tried
+is one more interval backwards, whose derivatives count with it. What arrives at once (``Arrivals``) preconditions them,
+so that a few directions are enough for many services.
 """
 
 from __future__ import annotations
@@ -13,13 +13,11 @@ import numpy as np
 
 from cirl_marl.dynamics.adjoint import Adjoint, IntervalInputs
 from cirl_marl.dynamics.complementarity import TINY
+from cirl_marl.dynamics.krylov import conjugate_residuals
 from cirl_marl.dynamics.supply import Supply
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.compartment_model import Bools
-
-ACCURACY, LEAST = 1e-11, 1e-290
-"""Part of ∂L/∂v that may be left, and what is taken for 0."""
 
 
 class SupplyAdjoint:
@@ -48,25 +46,17 @@ class SupplyAdjoint:
             return result
         per_extent, transposed = self._extents(inputs, step, idle)
         residual = self._by_extent(result, per_extent)
-        total, enough = _stack(result, np.zeros_like(residual)), ACCURACY * _size(residual)
-        basis: list[tuple[Floats, Floats]] = []
-        while (_size(residual) > enough).any():
-            if len(basis) > len(residual):
-                arcs, name = ", ".join(self._supply.arcs), self._adjoint.dynamics.network.name
-                raise CirlError(f"network '{name}': how supplies answer each other has no derivative: {arcs}")
-            lacks = np.ascontiguousarray(residual.T)[..., None]
+
+        def respond(lack: Floats) -> tuple[Floats, Floats]:
+            lacks = np.ascontiguousarray(lack.T)[..., None]
             direction: Floats = np.asarray(np.linalg.solve(transposed, lacks)[..., 0].T, dtype=np.float64)
             trial = self._adjoint.pull_back(inputs, step, *self._by_measures(direction))
-            image, effect = self._by_extent(trial, per_extent), _stack(trial, direction)
-            for earlier_image, earlier_effect in basis:
-                overlap = (image * earlier_image).sum(axis=0)
-                image, effect = image - overlap * earlier_image, effect - overlap * earlier_effect
-            size = _size(image)
-            inverse = np.divide(1.0, size, out=np.zeros_like(size), where=size > LEAST)
-            image, effect = image * inverse, effect * inverse
-            part = (residual * image).sum(axis=0)
-            residual, total = residual - part * image, total - part * effect
-            basis.append((image, effect))
+            return self._by_extent(trial, per_extent), _stack(trial, direction)
+
+        total = conjugate_residuals(residual, _stack(result, np.zeros_like(residual)), respond)
+        if total is None:
+            arcs, name = ", ".join(self._supply.arcs), self._adjoint.dynamics.network.name
+            raise CirlError(f"network '{name}': how supplies answer each other has no derivative: {arcs}")
         return self._with_bounds(inputs, step, idle, per_extent, total)
 
     def _extents(self, inputs: IntervalInputs, step: Integers, idle: Bools) -> tuple[Floats, Floats]:
@@ -78,7 +68,7 @@ class SupplyAdjoint:
         low, high = supply.bounds(step, inputs.factors)
         amount = inputs.controls[supply.rows]
         per_extent = np.where(idle & (amount > low) & (amount < high), supply.weights, 0.0)
-        rate = dynamics.rate(inputs.controls, step, inputs.factors)
+        rate = dynamics.orders.further_shares(dynamics.rate(inputs.controls, step, inputs.factors))
         services = len(supply.demand)
         slope = supply.slope(supply.arrivals(dynamics.routing.routes(rate)), per_extent) * supply.duration
         least = TINY * dynamics.network.episode.control_interval * supply.total(per_extent)
@@ -121,9 +111,3 @@ def _stack(derivatives: IntervalInputs, lacks: Floats) -> Floats:
     """Return all derivatives below each other, shape (rows, B)."""
     parts = (derivatives.stock, derivatives.controls, derivatives.factors, lacks)
     return np.concatenate([part for part in parts if part is not None])
-
-
-def _size(vectors: Floats) -> Floats:
-    """Return the lengths of the columns."""
-    lengths: Floats = np.sqrt((vectors**2).sum(axis=0))
-    return lengths

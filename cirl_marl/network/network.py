@@ -30,7 +30,7 @@ from cirl_marl.network.processes import DisturbanceProcesses
 from cirl_marl.network.rowsum import Floats, Integers, RowSum, spans
 from cirl_marl.network.series import Series
 from cirl_marl.network.specification import Specification
-from cirl_marl.network.split_fractions import Split, splits
+from cirl_marl.network.split_fractions import Split, is_order, splits
 from cirl_marl.network.substances import CONTENT, changes, changing_sources, contents
 from cirl_marl.network.uncertainty import CAPACITY, CERTAIN, factor_ranges
 from cirl_marl.network.validation import problems
@@ -225,6 +225,12 @@ class Network(Specification):
     def recipients(self) -> Integers:
         """Recipient node of each arc, shape (arcs,)."""
         return _read_only(np.array([self.node_index[arc.recipient] for arc in self.arcs], dtype=np.intp))
+
+    @cached_property
+    def orders(self) -> tuple[int, ...]:
+        """Arcs that order from nodes that store nothing, by position."""
+        stockless = {node.id for node in self.nodes if not node.stores}
+        return tuple(k for k, arc in enumerate(self.arcs) if is_order(arc, stockless))
 
     @cached_property
     def splits(self) -> tuple[Split, ...]:

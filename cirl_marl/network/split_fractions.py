@@ -5,14 +5,15 @@ Shares that ask for more than there is are cut towards their lower bounds, all b
 
     s_k = low_k + (a_k − low_k)·min(1, (1 − Σ low)/Σ(a − low)),    s_j = π_j·(1 − Σ s_k)
 
-so that they sum to 1 and low_k ≤ s_k ≤ high_k, always.
+so that they sum to 1 and low_k ≤ s_k ≤ high_k, always. An order from a node that stores nothing takes any share, as
+much as it is of what passes there in an interval (``dynamics.orders``).
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated, Any
 
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cirl_marl.network.declarations import with_field_docs
-from cirl_marl.network.elements import ControlKind, Law
+from cirl_marl.network.elements import Arc, Control, ControlKind, Law
 from cirl_marl.network.rowsum import Floats, Integers, single_column
 from cirl_marl.network.series import Series
 from cirl_marl.network.specification import Specification
@@ -29,6 +30,8 @@ ROUNDING = 1e-12
 """By how much lowest shares may exceed 1 together, as sums of decimals round."""
 LEAST = 1e-9
 """Share that has to leave a loop in each round at the least; a smaller one is taken for a rounding of none."""
+ANY_SHARE = Control(kind=ControlKind.SHARE, low=0.0, neutral=0.0, high=1.0)
+"""What an order takes of what passes a node that stores nothing."""
 SUMS = 1e-6
 """Distance from 1 at which given shares count as summing to it; they are then scaled to do so."""
 
@@ -57,6 +60,13 @@ class Split:
         """Return what there is to know of each interval, one column if nothing changes, shape (numbers, intervals)."""
         bounds, proportions = single_column(self.bounds), single_column(self.proportions)
         return np.concatenate([bounds.reshape(-1, bounds.shape[-1]), proportions])
+
+    def without(self, orders: Collection[int]) -> Split:
+        """Return the split without the arcs that order."""
+        places = [n for n, k in enumerate(self.controlled_arcs) if k not in orders]
+        arcs, bounds = tuple(self.controlled_arcs[n] for n in places), single_column(self.bounds)[:, places]
+        shape = (3, len(places), self.bounds.shape[-1])
+        return replace(self, controlled_arcs=arcs, bounds=np.broadcast_to(bounds, shape))
 
     def least(self, leaves: NDArray[np.bool_], steps: Integers) -> Floats:
         """Return the least that some of the arcs get together in some intervals, shape (intervals,).
@@ -110,11 +120,17 @@ def proportions(shares: Floats, remainder: Floats) -> Floats:
     return np.asarray(weights / weights.sum(axis=0))
 
 
+def is_order(arc: Arc, stockless: Collection[str]) -> bool:
+    """Return whether an arc orders from one of the nodes that store nothing: a flow, whatever enters them."""
+    return arc.donor in stockless and arc.law in (Law.CONTROLLED, Law.EXOGENOUS)
+
+
 def splits(network: Specification) -> list[Split]:
     """Return the splits of a network, in the order of their nodes."""
     arcs: dict[str, list[int]] = {}
+    stockless = {node.id for node in network.nodes if not node.stores}
     for k, arc in enumerate(network.arcs):
-        if arc.law is Law.SHARE:
+        if arc.law is Law.SHARE or is_order(arc, stockless):
             arcs.setdefault(arc.donor, []).append(k)
     horizon = network.episode.horizon
     divisions = []
@@ -124,6 +140,7 @@ def splits(network: Specification) -> list[Split]:
             controlled_exits = {
                 k: arc.control for k, arc in exits if arc.control is not None and arc.control.kind is ControlKind.SHARE
             }
+            controlled_exits |= {k: ANY_SHARE for k, arc in exits if arc.law is not Law.SHARE}
             controls = controlled_exits.values()
             free = [(k, arc.share) for k, arc in exits if k not in controlled_exits]
             sides: list[list[Any]] = [[getattr(c, side) for c in controls] for side in ("low", "neutral", "high")]

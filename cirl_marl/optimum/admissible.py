@@ -73,6 +73,9 @@ class Admissible:
     neutral_valve: Annotated[Floats, "v while nobody acts, shape (steps, nodes)"]
     service_low: Annotated[Floats, "lower end of the band of each service, shape (steps, services)"]
     splits: Annotated[tuple[Split, ...], "the arcs that share what leaves a node"]
+    order_range: Annotated[
+        Floats, "least and most that ``network.orders`` ask for, mass/time, shape (2, steps, orders)"
+    ]
     capacity_arcs: Annotated[Integers, "arcs that the stock of another node limits"]
     capacity_rate: Annotated[Floats, "flow that a unit of it can carry, shape (steps, limited arcs), 1/time"]
     mixtures: Annotated[Mixtures | None, "scheduled flows of components; None if contents are not followed"]
@@ -123,7 +126,11 @@ class Admissible:
         setting[0][:, has_capacity] = 0.0  # as long as nothing is built they carry nothing
         with_capacity = [arc for arc in network.arcs if arc.capacity_node and network.original(arc.id) == arc.id]
         capacity_arcs = np.array([network.arc_index[arc.id] for arc in with_capacity], dtype=np.intp)
-        split_arcs = network.splits
+        split_arcs, orders = network.splits, [*network.orders]
+        coefficients = [network.interval_means(LAWS[arc.law].coefficient(arc, network)) for arc in network.arcs]
+        base = np.array(coefficients, dtype=float).reshape(-1, steps).T.copy()
+        order_range = setting[::2, :, orders] * base[:, orders]
+        setting[:, :, orders], base[:, orders] = np.array([0.0, 0.5, 1.0])[:, None, None], 1.0
         for split in split_arcs:
             arcs = [*split.controlled_arcs, *split.other_arcs]
             wishes = setting[:, :, list(split.controlled_arcs)].transpose(0, 2, 1)
@@ -131,8 +138,7 @@ class Admissible:
             setting[:, :, arcs] = np.stack([low.T, neutral.T, high.T])
         driver = np.where([arc.law is Law.RECIPIENT for arc in network.arcs], network.recipients, network.donors)
         driver[np.array([LAWS[arc.law].is_scheduled for arc in network.arcs], dtype=bool)] = -1
-        coefficients = [network.interval_means(LAWS[arc.law].coefficient(arc, network)) for arc in network.arcs]
-        base = np.array(coefficients, dtype=float).reshape(-1, steps).T
+        driver[orders] = network.donors[orders]
         mixtures = None
         if isinstance(network, ComponentNetwork):
             mixtures = _mixtures(lifetimes, setting, valve, base, like, present)
@@ -149,6 +155,7 @@ class Admissible:
             neutral_valve=valve[1],
             service_low=np.array(service_low, dtype=float).reshape(-1, steps).T,
             splits=split_arcs,
+            order_range=order_range,
             capacity_arcs=capacity_arcs,
             capacity_rate=np.array([network.interval_means(arc.capacity_rate) for arc in with_capacity], dtype=float)
             .reshape(-1, steps)
@@ -391,6 +398,7 @@ def normalised_actions(
     valve = np.clip(valve, *valve_range)
     driver = np.where(admissible.by_schedule, 1.0, stock[:, admissible.driver])
     setting = np.clip(_ratio(flow, base * driver * valve[:, network.donors], neutral), *admissible.setting[:, period])
+    setting[:, [*network.orders]] = flow[:, [*network.orders]]
     if (mixtures := admissible.mixtures) is not None:
         first, *others = mixtures.arcs[:, mixtures.scheduled]
         setting[:, first] += sum(setting[:, arcs] for arcs in others)

@@ -310,6 +310,38 @@ def least_deliveries(admissible: Admissible, reach: Reach, intervals: range, row
         rows.put(row, t * layout.size + layout.flow[piece * (layout.degree + 1)] + k, -1.0)
 
 
+def order_rows(admissible: Admissible, reach: Reach, intervals: range, rows: ProgramRows) -> None:
+    """Add the rows of orders from nodes that store nothing; keys (6, step, node or arc, family).
+
+    Of mean throughputs q at most q̄, orders D_e in [D̲_e, D̄_e] get f_e = D_e·min(1, q/ΣD), so that
+
+        f_e ≤ D̄_e,    D̲_r f_e ≤ D̄_e f_r,    D̲_e f_r ≤ D̄_r f_e,    min(1, ΣD̲/q̄)·q ≤ Σf,
+
+    r being the order that is free the least, and the last as min(q, ΣD̲) is concave in q and lies above its chord.
+    """
+    network, layout, period = admissible.network, rows.layout, slice(intervals.start, intervals.stop)
+    orders, mean, t = np.array(network.orders, dtype=np.intp), 1.0 / len(layout.moments), np.arange(len(intervals))
+    t, (low, high) = t[:, None], admissible.order_range[:, period]
+    markets, of = np.unique(network.donors[orders], return_inverse=True)
+    flow, through = ((t * layout.size + column)[..., None] for column in (layout.flow, layout.stock))
+    total, most = np.zeros((len(intervals), len(markets))), reach.upper[:, markets]
+    np.add.at(total.T, of, low.T)
+    part = np.divide(total, most, out=np.ones_like(most), where=most > total)
+    least, limit = rows.add(6, t, markets, 0), rows.add(6, t, orders, 1)
+    rows.put(least[:, None], through + markets, mean * part[:, None])
+    rows.put(least[:, None, of], flow + orders, -mean)
+    rows.put(limit[:, None], flow + orders, mean)
+    rows.limit(limit, high)
+    freedom = np.divide(high - low, high, out=np.zeros_like(high), where=high > 0).max(axis=0, initial=0.0)
+    ranked = np.lexsort((freedom, of))
+    firsts = ranked[np.searchsorted(of[ranked], np.arange(len(markets)))][of]
+    partners = np.flatnonzero(firsts != np.arange(len(orders)))
+    for family, (one, two) in enumerate(((partners, firsts[partners]), (firsts[partners], partners)), start=2):
+        pair = rows.add(6, t, orders[partners], family)
+        rows.put(pair[:, None], flow + orders[one], mean * low[:, None, two])
+        rows.put(pair[:, None], flow + orders[two], -mean * high[:, None, one])
+
+
 def idle_groups(admissible: Admissible) -> list[tuple[Integers, Floats]]:
     """Return the idle arcs of each service that several make up for, with their weights w.
 

@@ -7,7 +7,8 @@ A flow F = c·o·a·y follows from a control c, what else scales it, o ∈ [o̲,
 
 for all weighted means of F and y. The rows are exact where y = ȳ, as by schedule, and o is one value; else z counts at
 least the part y/ȳ. A flow that may be less than its control asks for has no row of the second kind: one that its donor
-or a capacity cuts, or a share beside others that together may ask for more than 1. Factors on lifetimes have none.
+or a capacity cuts, or a share beside others that together may ask for more than 1. Factors on lifetimes have none,
+nor have orders from nodes that store nothing.
 """
 
 from __future__ import annotations
@@ -76,7 +77,11 @@ def _factors(
     network, is_cut = admissible.network, _cut_shares(admissible, period)
     for k, arc in enumerate(network.arcs if agents else ()):
         by_schedule = bool(admissible.by_schedule[k])
-        if k in admissible.lifetimes.exit_arcs or (by_schedule and network.original(arc.id) != arc.id):
+        if (
+            k in admissible.lifetimes.exit_arcs
+            or k in network.orders
+            or (by_schedule and network.original(arc.id) != arc.id)
+        ):
             continue
         parts = [network.arc_index[id_] for id_ in network.components_of(arc.id)] if by_schedule else [k]
         is_exact = np.asarray(reach.uncut[:, parts].all(axis=1) if by_schedule else ~is_cut[:, k])
@@ -101,7 +106,7 @@ def _cut_shares(admissible: Admissible, period: slice) -> NDArray[np.bool_]:
     """Return which arcs may get less than the share that is asked for, shape (steps, arcs)."""
     network = admissible.network
     is_cut = np.zeros((network.episode.horizon, len(network.arcs)), dtype=bool)
-    for split in admissible.splits:
+    for split in (split.without(network.orders) for split in admissible.splits):
         ranges = [control_range(network, network.arcs[k], admissible.agents) for k in split.controlled_arcs]
         if ranges:
             is_cut[:, list(split.controlled_arcs)] = (np.sum(ranges, axis=0)[2] > 1.0)[:, None]

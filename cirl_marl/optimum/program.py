@@ -28,6 +28,7 @@ from cirl_marl.optimum.constraints import (
     held_controls,
     idle_supplies,
     least_deliveries,
+    order_rows,
     service_levels,
     throughputs,
     valve_envelopes,
@@ -223,6 +224,7 @@ class Programs:
         valve_envelopes(admissible, reach, intervals, rows)
         idle_supplies(admissible, reach, intervals, rows)
         least_deliveries(admissible, reach, intervals, rows)
+        order_rows(admissible, reach, intervals, rows)
         low, high = _box(admissible, reach, lifetime_flow, layout, period)
         if mixtures is not None:
             mixture_rows(admissible, reach, intervals, rows)

@@ -32,7 +32,7 @@ from scipy import sparse
 
 from cirl_marl.dynamics.ledger import Ledger
 from cirl_marl.environments.actuators import planned_deviation
-from cirl_marl.network import Floats, Integers
+from cirl_marl.network import Floats, Integers, RowSum
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
 from cirl_marl.optimum.aims import NO_AIMS, Aims, RateTables, account_rows
@@ -156,6 +156,12 @@ class Future:
         self._weight = service_weight
         controlled = ~admissible.by_schedule & (admissible.rate[0] < admissible.rate[1]).any(axis=0)
         controlled[admissible.lifetimes.exit_arcs] = False
+        donors = admissible.network.donors
+        self._markets = np.unique(donors[[*admissible.network.orders]])
+        self._exits = np.flatnonzero(np.isin(donors, self._markets))
+        self._exit_sum = RowSum(
+            np.searchsorted(self._markets, donors[self._exits]), self._exits, 1.0, (len(self._markets), self._arcs)
+        )
         self._hold: Integers = np.flatnonzero(controlled) if like is None else like._hold
 
     def at(self, place: int, interval: int) -> Future:
@@ -201,8 +207,24 @@ class Future:
             matrix = rows.matrices()[0]
             equal = sparse.vstack([problem.equal, matrix], format="csr")
             equal_to = np.append(problem.equal_to, np.zeros(matrix.shape[0]))
-            problem = replace(problem, equal=equal, equal_to=equal_to, low=low, under_to=under_to)
+            under, leftover = problem.under, self._leftovers(layout, correction.through)
+            if leftover is not None:
+                under = sparse.vstack([under, leftover.matrices()[0]], format="csr")
+                under_to = np.append(under_to, leftover.limits())
+            problem = replace(problem, equal=equal, equal_to=equal_to, low=low, under=under, under_to=under_to)
         return problem if task.later is None else with_distance(problem, task.later)
+
+    def _leftovers(self, layout: Layout, through: Floats) -> ProgramRows | None:
+        """Return rows by which nodes leave so much beside what is ordered as less passed them than was planned."""
+        if not len(self._markets):
+            return None
+        rows, t = ProgramRows(layout, len(through)), np.arange(len(through))[:, None]
+        rest_arcs = np.setdiff1d(self._exits, self.admissible.network.orders)
+        row, columns = rows.add(0, t, self._markets), (t * layout.size + layout.flow)[..., None] + rest_arcs
+        of = np.searchsorted(self._markets, self.admissible.network.donors[rest_arcs])
+        rows.put(row[:, None, of], columns, -1.0 / len(layout.moments))
+        rows.limit(row, -np.maximum(through, 0.0))
+        return rows
 
     def _rates(self, intervals: range, accounts: slice | list[int], counts: Floats) -> RateTables:
         """Return the rates of some accounts, times what amounts of each interval of the episode count."""
@@ -270,11 +292,12 @@ class Future:
             is_counted = (self._counts[:, task.intervals.start : task.intervals.stop] != 0).T
             more = bookings.sum(axis=0) - rows_of_totals @ plan - beside
             excess += np.where(is_counted, more / np.maximum(is_counted.sum(axis=0), 1), 0.0)
+        through = self._exit_sum((layout.means(variables)[1][:, : self._arcs] - outcome.flow).T).T
         return WindowTrial(
             actions,
             outcome.value,
             np.minimum(level, 1.0).mean(axis=0),
-            Correction(error, excess, *self._factors(variables, intervals)),
+            Correction(error, excess, through, *self._factors(variables, intervals)),
             bookings,
             variables[:, layout.level : layout.imbalance],
         )

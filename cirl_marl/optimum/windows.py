@@ -9,7 +9,7 @@ Reference: Kerrigan and Maciejowski 2000, UKACC Control (exact penalties in mode
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import field, replace
+from dataclasses import field, fields, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -34,12 +34,13 @@ class Correction:
         Floats,
         "what was booked beyond the plan, evenly over those that count, in parts of budgets, (intervals, budgets)",
     ]
+    through: Annotated[Floats, "Q̂ − Q of each node that orders leave, shape (intervals, nodes), mass/time"]
     rate: Annotated[Floats, "flow over what drives it, planned, shape (intervals, arcs), 1/time"]
     valve: Annotated[Floats, "planned valve of each node, shape (intervals, nodes)"]
 
     def of(self, places: Integers) -> Correction:
         """Return that of other intervals, of which each is taken to be like one of these."""
-        return Correction(self.error[places], self.excess[places], self.rate[places], self.valve[places])
+        return Correction(*(getattr(self, part.name)[places] for part in fields(self)))
 
 
 @positional_record
@@ -115,7 +116,7 @@ class WindowPlan:
         places = np.clip(np.arange(intervals.start, intervals.stop) - own.start, 0, len(own) - 1)
         correction = corrections[0]
         if len(corrections) > 1:
-            parts = ([getattr(c, name) for c in corrections] for name in ("error", "excess", "rate", "valve"))
+            parts = ([getattr(each, part.name) for each in corrections] for part in fields(correction))
             correction = Correction(*(np.mean(part, axis=0) for part in parts))
         return (correction.of(places),) * futures
 

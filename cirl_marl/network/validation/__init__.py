@@ -59,7 +59,7 @@ def problems(network: Specification) -> Iterator[str]:
         inflows.setdefault(arc.recipient, []).append(arc)
     for node in network.nodes:
         yield from node_problems(network, node)
-        yield from storage_problems(node, outflows.get(node.id, ()))
+        yield from storage_problems(network, node, outflows.get(node.id, ()))
         yield from lifetime_problems(network, node, [*inflows.get(node.id, ()), *outflows.get(node.id, ())])
     lawful = not strange
     for arc in network.arcs:

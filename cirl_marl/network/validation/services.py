@@ -99,6 +99,8 @@ def supply_problems(network: Specification) -> Iterator[str]:
     stockless_exits: dict[str, list[Arc]] = {node.id: [] for node in network.nodes if not node.stores}
     for arc in network.arcs:
         # supplies follow what is no substance
+        if arc.law not in (Law.SHARE, Law.DONOR):
+            continue  # what is ordered is no more for what arrives more
         if not network.substances or arc.control is not None or arc.share is None or extremes(arc.share)[1] > LEAST:
             stockless_exits.get(arc.donor, []).append(arc)
     for arc in network.arcs:

@@ -24,15 +24,13 @@ from cirl_marl.network.specification import Specification
 from cirl_marl.network.substances import is_past
 from cirl_marl.network.validation.settings import is_whole
 
-OWN_DEMANDS = (
-    "for products with demands of their own let it share out what is recycled, and primary material enter behind it, "
-    "by an arc for each that makes up for its service (docs/yearly_networks.md)"
-)
+ORDER_LAWS = (Law.CONTROLLED, Law.EXOGENOUS)
+"""Laws of flows that are asked for, whatever there is."""
 NARROWEST, WIDEST = 0.02, 3.0
 """Deviations of a lifetime, relative to its mean, that stages follow at all."""
 
 
-def storage_problems(node: Node, outflows: Sequence[Arc]) -> Iterator[str]:
+def storage_problems(network: Specification, node: Node, outflows: Sequence[Arc]) -> Iterator[str]:
     """Yield what does not go with a stock that a node has, has not, or whose start is unknown."""
     subject, shares = f"node '{node.id}'", [arc.id for arc in outflows if arc.law is Law.SHARE]
     if node.stores:
@@ -60,15 +58,37 @@ def storage_problems(node: Node, outflows: Sequence[Arc]) -> Iterator[str]:
         yield f"{subject}: role '{node.role}': a node that stores nothing is of the technosphere"
     if not outflows:
         yield f"{subject}: it stores nothing and no arc leaves it, so that what enters has nowhere to go"
-    orders = [arc.id for arc in outflows if arc.law in (Law.CONTROLLED, Law.EXOGENOUS)]
-    if orders:
-        arcs = f"arc{'s' * (len(orders) > 1)} {', '.join(map(repr, orders))}"
-        reason = f"it stores nothing, so that only law 'share' can leave it, not what is ordered by {arcs}"
-        yield f"{subject}: {reason}; {OWN_DEMANDS}"
+    orders = [arc.id for arc in outflows if arc.law in ORDER_LAWS]
     for arc in outflows:
         if arc.law is not Law.SHARE and arc.id not in orders:
             reason = f"its donor '{node.id}' stores nothing, so that only law 'share' can leave it"
             yield f"arc '{arc.id}': law '{arc.law}': {reason}"
+    if orders:
+        yield from _order_problems(network, subject, orders, outflows)
+
+
+def _order_problems(
+    network: Specification, subject: str, orders: Sequence[str], outflows: Sequence[Arc]
+) -> Iterator[str]:
+    """Yield what does not go with orders from a node that stores nothing."""
+    arcs = f"arc{'s' * (len(orders) > 1)} {', '.join(map(repr, orders))}"
+    batches = any(arc.law is Law.BATCH for arc in network.arcs)
+    obstacles = {
+        "substances": bool(network.substances),
+        "batches": batches,
+        f"solver '{network.episode.solver}'": network.episode.solver != "exact",
+    }
+    for obstacle in (obstacle for obstacle, is_there in obstacles.items() if is_there):
+        yield f"{subject}: it stores nothing, and orders from it, as of {arcs}, do not go with {obstacle}"
+    if not any(arc.law is Law.SHARE for arc in outflows):
+        yield f"{subject}: {arcs} may order less than enters it; an arc of law 'share' has to take the rest"
+    for arc in outflows:
+        if arc.id in orders and (arc.makes_up_for or arc.capacity_node):
+            field = "makes_up_for" if arc.makes_up_for else "capacity_node"
+            yield f"arc '{arc.id}': {field}: it orders from '{arc.donor}', which stores nothing; leave it out"
+        if arc.law is Law.SHARE and arc.control is not None:
+            remedy = f"let it share out what arrives at another node that stores nothing, behind '{arc.donor}'"
+            yield f"arc '{arc.id}': control: its donor serves {arcs} first, and others share the rest; {remedy}"
 
 
 def series_problems(network: Specification) -> Iterator[str]:
