@@ -179,7 +179,7 @@ def test_random_networks(seed: int) -> None:
                 continue
             ordered = np.array([ordered_flow(env, state, k, step) for k in orders])
             part = np.minimum(1.0, flow[exits].sum(axis=0) / np.maximum(ordered.sum(axis=0), 1e-300))
-            np.testing.assert_allclose(flow[orders], ordered * part, rtol=2e-12, atol=1e-12)
+            np.testing.assert_allclose(flow[orders], ordered * part, rtol=1e-11, atol=1e-11)
         for service in network.services[1:]:
             supply, stock = flow[network.arc_index[f"primary_{service.id}"]], after[network.node_index[service.id]]
             low = network.interval_means(service.low)[step]
@@ -208,19 +208,19 @@ def test_what_passes_markets_is_what_steps_from_nothing_come_to(seed: int) -> No
     rate = dynamics.rate(dynamics.neutral[:, :1], np.zeros(1, dtype=np.intp))
     flow = np.zeros_like(rate)
     flow[orders.inflows] = rng.uniform(0, 20, (len(orders.inflows), 1)) * rng.integers(0, 2)
-    found = orders.clear(rate, flow, rng.uniform(0, 30, (len(orders.markets), 1)))
+    through, _ = orders.clear(rate, flow)
     stores, arcs = len(staged.stores), np.arange(len(staged.arcs))
     is_order = np.isin(arcs, orders.arcs)
     for _ in range(20_000):
-        through = np.bincount(staged.recipients, flow[:, 0], len(staged.nodes))[staged.donors]
+        passing = np.bincount(staged.recipients, flow[:, 0], len(staged.nodes))[staged.donors]
         total = np.bincount(staged.donors, rate[:, 0] * is_order, len(staged.nodes))[staged.donors]
-        part = np.divide(np.minimum(through, total), total, out=np.zeros_like(total), where=total > 0)
-        sent = np.where(is_order, rate[:, 0] * part, rate[:, 0] * np.maximum(through - total, 0.0))
+        part = np.divide(np.minimum(passing, total), total, out=np.zeros_like(total), where=total > 0)
+        sent = np.where(is_order, rate[:, 0] * part, rate[:, 0] * np.maximum(passing - total, 0.0))
         before, flow = flow, np.where(staged.donors >= stores, sent, flow[:, 0])[:, None]
         if np.abs(flow - before).max() <= 1e-15 * flow.max():
             break
     passed = np.bincount(staged.recipients, flow[:, 0], len(staged.nodes))[orders.markets]
-    np.testing.assert_allclose(found[:, 0], passed, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(through[:, 0], passed, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("seed", [9, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 6))])

@@ -286,9 +286,7 @@ class Dynamics(FlowLaws):
         if self.physical:
             rate = self.scheduled.cut(stock, rate)
         if self.orders:
-            entry_flow = self.flow(stock, rate)
-            through = self.orders.clear(rate, entry_flow, np.zeros((len(self.orders.markets), stock.shape[1])))
-            rate = self.orders.shares(rate, through)
+            rate = self.orders.shares(rate, self.orders.clear(rate, self.flow(stock, rate))[0])
         routes = self.routing.routes(rate)
         flow = self._flow_at(stock, inner, controls, rate, routes)
         if not self._heedless:

@@ -22,18 +22,32 @@ Complementarity Problem.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Annotated
 
 import numpy as np
 
 from cirl_marl.dynamics.krylov import Acceleration
-from cirl_marl.dynamics.routing import Routing
+from cirl_marl.dynamics.routing import IntervalRoutes, Routing
 from cirl_marl.network import Floats, Integers, Network, RowSum
 from cirl_marl.network.compartment_model import Bools
+from cirl_marl.network.declarations import positional_record
 
-ROUNDS, CLOSE, ROUNDING = 100, 1e-13, 1e-15
+ROUNDS, CLOSE, ROUNDING = 100, 1e-12, 1e-15
 """Most intervals that are simulated; how near q must be to what it leads to, relative to it, and to the largest q."""
 BLOCKS, PIVOTS = 20, 20
 """Changes of which nodes have enough, all at once, then one by one: most of them, the latter for each node."""
+
+
+@positional_record
+class Clearing:
+    """Which markets have enough for all that is ordered."""
+
+    has_enough: Annotated[Bools, "whether each does, shape (markets, B)"]
+    routes: Annotated[IntervalRoutes, "past those that do the rest goes on, past others what is ordered"]
+
+    def of_copies(self, copies: Integers) -> Clearing:
+        """Return that of some copies."""
+        return Clearing(self.has_enough[:, copies], self.routes.of_copies(copies))
 
 
 class Orders:
@@ -100,11 +114,11 @@ class Orders:
         Raises:
             ArithmeticError: if that comes to no end; names the node.
         """
-        through, copies = self.clear(rate, flow, np.zeros((len(self.markets), rate.shape[1]))), np.arange(rate.shape[1])
-        result, accelerate = self.shares(rate, through), Acceleration()
+        through, clearing = self.clear(rate, flow)
+        result, accelerate, copies = self.shares(rate, through), Acceleration(), np.arange(rate.shape[1])
         for _ in range(ROUNDS):
             rates, now = rate.take(copies, axis=1), through.take(copies, axis=1)
-            ahead = self.clear(rates, simulate(copies, result.take(copies, axis=1)), now)
+            ahead, clearing = self.clear(rates, simulate(copies, result.take(copies, axis=1)), clearing)
             far = np.abs(ahead - now) > CLOSE * ahead + ROUNDING * ahead.max(axis=0)
             is_far = far.any(axis=0)
             if not is_far.any():
@@ -112,34 +126,37 @@ class Orders:
             # copy by copy in memory, so that sums have the same order whatever the batch
             points, steps = (np.ascontiguousarray(array.T) for array in (now, ahead - now))
             now, copies = np.maximum(accelerate(points, steps), 0.0).T[:, is_far], copies[is_far]
-            accelerate.select(is_far)
+            if not is_far.all():
+                accelerate.select(is_far)
+                clearing = clearing.of_copies(np.flatnonzero(is_far))
             through[:, copies], result[:, copies] = now, self.shares(rates[:, is_far], now)
         name = self._names[int(far.any(axis=1).argmax())]
         raise ArithmeticError(f"orders from node '{name}' are not settled after {ROUNDS} simulations of an interval")
 
-    def clear(self, rate: Floats, inflow: Floats, through: Floats) -> Floats:
+    def clear(self, rate: Floats, inflow: Floats, clearing: Clearing | None = None) -> tuple[Floats, Clearing]:
         """Return q of the markets, shape (markets, B), by block principal pivots, then by single ones (Murty 1974).
 
         Args:
             rate: of all arcs, of orders what is ordered, shape (arcs, B).
             inflow: mean flows of the arcs, of which ``inflows`` count, likewise.
-            through: what q may be near to, shape (markets, B).
+            clearing: where to begin from; None: all have enough.
 
         Raises:
-            ArithmeticError: if pivots come to no end.
+            ArithmeticError: if pivots come to no end; names the node.
         """
         total, entry_flow = self._sum(rate.take(self.arcs, 0)), np.zeros_like(rate)
         entry_flow[self.inflows] = inflow[self.inflows]
-        has_enough = through >= total
+        clearing = clearing or self._clearing(rate, np.ones(total.shape, dtype=bool))
         for pivot in range(BLOCKS + PIVOTS * len(self.markets)):
-            result = self._trial(rate, entry_flow, has_enough)
+            has_enough = clearing.has_enough
+            result = self._throughputs(rate, total, entry_flow, clearing)
             lack = (total - result) * np.where(has_enough, 1.0, -1.0)
             is_wrong = lack > ROUNDING * (10.0 * total + np.abs(result).max(axis=0))
             if not is_wrong.any():
-                return np.maximum(result, 0.0)
+                return np.maximum(result, 0.0), clearing
             if pivot >= BLOCKS:
                 is_wrong &= np.cumsum(is_wrong, axis=0) == 1
-            has_enough = has_enough ^ is_wrong
+            clearing = self._clearing(rate, has_enough ^ is_wrong)
         raise ArithmeticError(f"orders from node '{self._names[int(is_wrong.any(axis=1).argmax())]}' are not cleared")
 
     def pull_back(self, rate: Floats, through: Floats, adjoint: Floats) -> tuple[Floats, Floats]:
@@ -161,18 +178,23 @@ class Orders:
         """Return what mass moved along arcs is worth, shape (arcs, B), if what passes markets is worth so much."""
         return self._outflows.transpose()(worth)
 
-    def _trial(self, rate: Floats, entry_flow: Floats, has_enough: Bools) -> Floats:
-        """Return q if markets that have enough serve all that is ordered, be it more, and others have no rest."""
-        demand, shares, flow = rate.take(self.arcs, 0), rate.copy(), entry_flow.copy()
-        total, serves = self._sum(demand), has_enough.take(self._of, 0)
-        shares[self.arcs] = np.where(serves, 0.0, demand * _inverse(total).take(self._of, 0))
+    def _clearing(self, rate: Floats, has_enough: Bools) -> Clearing:
+        """Return what markets pass on if those that have enough serve all that is ordered and others have no rest."""
+        demand, shares = rate.take(self.arcs, 0), rate.copy()
+        part = np.where(has_enough, 0.0, _inverse(self._sum(demand)))
+        shares[self.arcs] = demand * part.take(self._of, 0)
         shares[self.rest_arcs] *= has_enough.take(self._of_rest, 0)
-        flow[self.arcs] = np.where(serves, demand, 0.0)
-        through, delivery = self._entries(flow), np.where(has_enough, total, 0.0)
-        through[self._places] -= delivery
         routes = self._routing.routes(shares)
         assert routes is not None
-        return np.asarray(self._routing.throughputs(through, routes)[self._rows] + delivery)
+        return Clearing(has_enough, routes)
+
+    def _throughputs(self, rate: Floats, total: Floats, entry_flow: Floats, clearing: Clearing) -> Floats:
+        """Return q that follows from what enters; of markets that have enough it may be less than is ordered."""
+        flow, delivery = entry_flow.copy(), np.where(clearing.has_enough, total, 0.0)
+        flow[self.arcs] = np.where(clearing.has_enough.take(self._of, 0), rate.take(self.arcs, 0), 0.0)
+        through = self._entries(flow)
+        through[self._places] -= delivery
+        return np.asarray(self._routing.throughputs(through, clearing.routes)[self._rows] + delivery)
 
 
 def _inverse(values: Floats) -> Floats:
