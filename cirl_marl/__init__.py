@@ -92,6 +92,7 @@ if TYPE_CHECKING:
     from cirl_marl.network.elements import Service as Service
     from cirl_marl.network.elements import Substance as Substance
     from cirl_marl.network.network import Network as Network
+    from cirl_marl.network.piecewise import PiecewiseRate as PiecewiseRate
     from cirl_marl.network.series import Series as Series
     from cirl_marl.optimum.admissible import NoCertificate as NoCertificate
     from cirl_marl.optimum.bounds import Bound as Bound
@@ -165,6 +166,7 @@ _MODULES = {
         "Account Arc Control ControlKind Episode Law Node Objective Observation Role Service Substance"
     ),
     "network.network": "Network",
+    "network.piecewise": "PiecewiseRate",
     "network.series": "Series",
     "optimum.admissible": "NoCertificate",
     "optimum.bounds": "Bound bound envelope gap",

@@ -22,6 +22,7 @@ from cirl_marl import (
     Network,
     NetworkError,
     Node,
+    PiecewiseRate,
     Role,
     Series,
     Service,
@@ -288,3 +289,35 @@ def disturbed_networks(draw: st.DrawFn) -> Network:
     step = network.episode.solver_step  # the fastest draws need a shorter one
     interval = network.episode.control_interval
     return network.with_options(episode={} if step is None else {"solver_step": interval / round(3 * interval / step)})
+
+
+def in_pieces(network: Network, seed: int) -> Network:
+    """Return a network some of whose certain rates on accounts rise with what is charged for, in two or three pieces.
+
+    What flows, is held, or is away from neutral may be below, between and beyond the amounts at which they do.
+    """
+    rng = np.random.default_rng([seed, 11])
+
+    def pieces(rate: float, scale: float) -> PiecewiseRate | float:
+        if rng.random() < 0.3:
+            return rate
+        count = int(rng.integers(1, 3))
+        to, rises = np.cumsum(scale * rng.uniform(0.05, 1.0, count)), np.cumsum(abs(rng.normal(size=count)) + 0.01)
+        course = Series(times=(0.0, network.episode.control_interval), values=(1.0, 0.5))
+        rates = (rate, *(rate + abs(rate) * rises + rises).tolist())
+        return PiecewiseRate(to=tuple(to.tolist()), rates=rates, factor=course if rng.random() < 0.3 else 1.0)
+
+    def rising(part: Any) -> Any:
+        held = (part.initial[1] if isinstance(part, Node) and part.initial else 0.0) or part.scale
+        width = 1.0
+        if part.control is not None:
+            width = extremes(part.control.high)[1] - extremes(part.control.low)[0] or 1.0
+        scales = {"accounts": part.scale, "holding": held, "effort": width}
+        fields = {
+            name: {a: r if isinstance(r, Series) else pieces(r, scale) for a, r in dict(getattr(part, name)).items()}
+            for name, scale in scales.items()
+            if hasattr(part, name)
+        }
+        return replace(part, **fields)
+
+    return replace(network, nodes=tuple(map(rising, network.nodes)), arcs=tuple(map(rising, network.arcs)))

@@ -45,7 +45,8 @@ from cirl_marl.network.disturbances import DisturbanceEffect, Markov
 from cirl_marl.network.uncertainty import Spread
 from cirl_marl.optimum import improve_plan, simulate_plan
 from cirl_marl.optimum.draw_proofs import Sampling
-from cirl_marl.optimum.linearised import ActionPlan, _Efforts
+from cirl_marl.optimum.linearised import ActionPlan
+from cirl_marl.optimum.step_parts import Efforts
 from cirl_marl.report.account_tables import accounts_table
 
 COST = (Account(id="cost", unit="EUR_2023"),)
@@ -331,15 +332,15 @@ def test_steps_of_plans_know_the_kinks() -> None:
     network = replace(network, services=(service,))
     solved = bound(network, aim="cost", min_service=0.1)
     middle, program, moves, run, _ = small_step(solved, 0.1)
-    assert program.effort.shape == (5, 1)
+    assert program.part.shape == (5, 1)
     for share in (0.5, 2.0):
         target = middle.actions + share * (-0.5 - middle.actions)  # −0.5 is neutral
         trial = simulate_plan(replace(middle, actions=np.clip(target, -1.0, 1.0)))
         changes = np.abs(np.clip(target, -1, 1) + 0.5) - np.abs(middle.actions + 0.5)
-        moves[program.action], moves[program.effort] = np.clip(target, -1, 1) - middle.actions, changes
+        moves[program.action], moves[program.part] = np.clip(target, -1, 1) - middle.actions, changes
         assert program.problem.cost @ moves == pytest.approx(trial.accounts[0, 0] - run.accounts[0, 0], abs=1e-9)
         inside = program.problem.under @ moves - program.problem.under_to
-        rows = abs(program.problem.under[:, program.effort.ravel()]).sum(axis=1) > 0
+        rows = abs(program.problem.under[:, program.part.ravel()]).sum(axis=1) > 0
         assert (inside[rows] <= 1e-9).all() and inside[rows].max() == pytest.approx(0.0, abs=1e-9)
 
 
@@ -419,11 +420,11 @@ def test_efforts_of_a_window_are_those_of_the_episode_there() -> None:
     network = replace(network, arcs=(replace(network.arcs[0], control=order),))
     steps = network.episode.horizon
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (steps, len(network.agents)))
-    rates = Ledger(network).rates()[2]
+    is_charged = np.asarray(Ledger(network).rates()[2].any(axis=(0, 1)))
     parts = []
     for first, last in ((0, steps), (2, 5)):
         plan = SimpleNamespace(network=network, agents=network.agents, actions=actions[first:last])
-        parts.append(_Efforts.of(cast(ActionPlan, plan), rates[:, first:last], first))
+        parts.append(Efforts.of(cast(ActionPlan, plan), is_charged, first))
     whole, window = parts
     assert whole.away.std() > 0 and whole.half.std(axis=0).max() > 0
     np.testing.assert_array_equal(window.away, whole.away[2:5])

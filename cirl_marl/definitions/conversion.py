@@ -13,7 +13,7 @@ from cirl_marl.compartments import CompartmentModel, model_class
 from cirl_marl.definitions.code_permission import refusal
 from cirl_marl.definitions.data_files import DataFiles
 from cirl_marl.definitions.error_messages import parameter_mistakes
-from cirl_marl.definitions.quantities import AmountColumn, AmountSeries, QuantityTable, Range, RecordColumn
+from cirl_marl.definitions.quantities import AmountColumn, AmountSeries, PiecesTable, QuantityTable, Range, RecordColumn
 from cirl_marl.definitions.schema import Batches, ModelTable, NetworkTable
 from cirl_marl.definitions.series_tables import Clock, column_value, inline_series, product
 from cirl_marl.errors import CirlError, NetworkError, unknown_name
@@ -21,6 +21,7 @@ from cirl_marl.network import Network, elements
 from cirl_marl.network.declarations import Declaration, Numbers, Quantity, Rates, Subtable, declarations
 from cirl_marl.network.disturbances import KINDS, Correlation, DisturbanceEffect
 from cirl_marl.network.elements import LAW_FIELDS, Arc, Control, ControlKind, Law, Node
+from cirl_marl.network.piecewise import PiecewiseRate
 from cirl_marl.network.series import Series, Value, extremes
 from cirl_marl.network.uncertainty import Spread
 from cirl_marl.network.units import factor
@@ -166,17 +167,37 @@ class Converter:
             return tuple(map(tuple, entry))
         return tuple(entry) if isinstance(entry, list) else entry
 
-    def _named_value(self, declaration: Rates, id_: str, entry: Any, path: str, control_unit: str = "1") -> Value:
+    def _named_value(
+        self, declaration: Rates, id_: str, entry: Any, path: str, control_unit: str = "1"
+    ) -> elements.Rate:
         """Return what is charged on an account, or a part of a substance."""
         tables: Any = getattr(self.table, f"{declaration.of}s")
         if id_ not in tables:
             self.mistakes.append(f"{path}: {unknown_name(declaration.of, id_, tables)}")
             return 0.0
+        path, units = f"{path}.{id_}", self.table.units
         if declaration.of == "substance":
-            return self._value(entry, "1", f"{path}.{id_}")
-        units = self.table.units
+            return self._value(entry, "1", path)
         unit = declaration.unit(tables[id_].unit, units.mass, units.time, control_unit)
-        return self._value(entry, unit, f"{path}.{id_}")
+        if isinstance(entry, PiecesTable):
+            return self._pieces(entry, unit, declaration.unit_of_subject(units.mass, units.time, control_unit), path)
+        return self._value(entry, unit, path)
+
+    def _pieces(self, entry: PiecesTable, kind: str, subject: str, path: str) -> PiecewiseRate:
+        """Return a rate in pieces, and of what, in units ``kind`` and ``subject``."""
+        name = self._unit_of_product(entry, path)
+        unit, unit_of_amounts = self._factor(name, kind, path), self._factor(entry.to_unit, subject, f"{path}.to_unit")
+        rates, to = (
+            tuple(number * by for number in numbers)
+            for numbers, by in ((entry.values, unit), (entry.to, unit_of_amounts))
+        )
+        self._spread(entry, float(np.mean(rates or 0.0)), unit, path)
+        self._disturb(entry, name, kind, path)
+        if entry.multiplied_by is None:
+            return PiecewiseRate(to=to, rates=rates)
+        return PiecewiseRate(
+            to=to, rates=rates, factor=self._in_time(entry.multiplied_by, 1.0, f"{path}.multiplied_by")
+        )
 
     def _record(self, entry: RecordColumn, path: str) -> tuple[float, ...]:
         texts = {key: self._with_region(text, f"{path}.where.{key}") for key, text in entry.where.items()}
@@ -294,16 +315,21 @@ class Converter:
             return 1.0
         return value
 
+    def _unit_of_product(self, quantity: Any, path: str) -> str:
+        """Return the unit of a quantity times what it is multiplied by, if by anything."""
+        multiplier = quantity.multiplied_by
+        if multiplier is None:
+            return str(quantity.unit)
+        for key in UNCERTAINTY:
+            if getattr(multiplier, key) is not None:
+                self.mistakes.append(f"{path}.multiplied_by.{key}: belongs beside it, to the product")
+        if multiplier.multiplied_by is not None:
+            fault = "a quantity has one factor; multiply the others"
+            self.mistakes.append(f"{path}.multiplied_by.multiplied_by: {fault}")
+        return f"({quantity.unit})*({multiplier.unit})"
+
     def _value(self, quantity: Any, kind: str, path: str) -> Value:
-        multiplier, name = quantity.multiplied_by, quantity.unit
-        if multiplier is not None:
-            name = f"({name})*({multiplier.unit})"
-            for key in UNCERTAINTY:
-                if getattr(multiplier, key) is not None:
-                    self.mistakes.append(f"{path}.multiplied_by.{key}: belongs beside it, to the product")
-            if multiplier.multiplied_by is not None:
-                fault = "a quantity has one factor; multiply the others"
-                self.mistakes.append(f"{path}.multiplied_by.multiplied_by: {fault}")
+        multiplier, name = quantity.multiplied_by, self._unit_of_product(quantity, path)
         unit = self._factor(name, kind, path)
         value = self._in_time(quantity, unit, path)
         self._spread(quantity, value, unit, path)

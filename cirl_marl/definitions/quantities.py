@@ -50,8 +50,8 @@ class StatedTable(Table):
     )
     deviation: Deviation | None = Field(
         None,
-        description="standard deviation of what is not known exactly, in the same unit (of a series of its mean), or "
-        "relative, as ``5 %``",
+        description="standard deviation of what is not known exactly, in the same unit (of a series, or of pieces, of "
+        "its mean), or relative, as ``5 %``",
     )
     range: tuple[Number, Number] | None = Field(None, description="lowest and highest value that it may have, likewise")
     distribution: Literal["normal", "lognormal", "gamma", "uniform"] | None = Field(
@@ -68,6 +68,18 @@ class QuantityTable(StatedTable):
 
     value: Number
     unit: str = Field(description="pint unit, such as 'kt', '1/day', 't/day'; '1' if dimensionless")
+    source: Source
+
+
+class PiecesTable(StatedTable):
+    """A rate that is higher beyond some amounts: convex, so that bounds hold."""
+
+    to: list[Number] = Field(description="amounts up to which all values but the last hold")
+    to_unit: str = Field(
+        description="their unit: of a flow, such as 'kt/year', of a stock (``holding``) or of a control (``effort``)"
+    )
+    values: list[Number] = Field(description="rates, each higher than the one before; one more than in ``to``")
+    unit: str
     source: Source
 
 
@@ -150,21 +162,23 @@ class ColumnTable(AmountColumn, StatedTable):
     source: Source
 
 
-WORD, VALUE, SERIES, COLUMN = FORMS = ("<word>", "<value>", "<series>", "<column>")
+WORD, VALUE, PIECES, SERIES, COLUMN = FORMS = ("<word>", "<value>", "<pieces>", "<series>", "<column>")
 """Tags of the forms in which a number that may vary is given; in pydantic's mistakes they stand among the keys."""
 
 
 def _form(entry: object) -> str:
     keys = set(entry) if isinstance(entry, dict) else set()
+    if {"to", "to_unit"} & keys:
+        return PIECES
     return COLUMN if {"file", "column", "where"} & keys else SERIES if {"times", "values"} & keys else VALUE
 
 
-def number_forms(value: Any, series: Any, column: Any, word: str = "") -> Any:
+def number_forms(value: Any, series: Any, column: Any, word: str = "", pieces: Any = None) -> Any:
     """Return the type of a number that may be given in several forms, which its keys tell, or as a word.
 
     Without ``value`` it has to change in time.
     """
-    kinds = [(value, VALUE), (series, SERIES), (column, COLUMN)]
+    kinds = [(value, VALUE), (pieces, PIECES), (series, SERIES), (column, COLUMN)]
     forms = [Annotated[kind, Tag(tag)] for kind, tag in kinds if kind is not None]
     if not word:
         return Annotated[Union[*forms], Discriminator(_form)]
@@ -174,7 +188,7 @@ def number_forms(value: Any, series: Any, column: Any, word: str = "") -> Any:
 
 if not TYPE_CHECKING:
     Factor = number_forms(QuantityTable, SeriesTable, ColumnTable) | None
-for _table in (StatedTable, QuantityTable, SeriesTable, ColumnTable):
+for _table in (StatedTable, QuantityTable, PiecesTable, SeriesTable, ColumnTable):
     _table.model_rebuild()
 
 

@@ -129,6 +129,7 @@ def _field_type(declaration: Declaration, hint: Any) -> Any:
         return quantities.Time
     if isinstance(declaration, Rates):
         number = VaryingQuantity if declaration.number.varies else FixedQuantity
+        number = AccountRate if declaration.of == "account" else number
         return dict[Identifier, number]  # type: ignore[valid-type]
     if isinstance(declaration, Quantity) and declaration.unit_of_table:
         return quantities.Number
@@ -151,6 +152,9 @@ def _disturbance_table(kind: str) -> Any:
 
 
 VaryingQuantity = quantities.number_forms(quantities.QuantityTable, quantities.SeriesTable, quantities.ColumnTable)
+AccountRate = quantities.number_forms(
+    quantities.QuantityTable, quantities.SeriesTable, quantities.ColumnTable, pieces=quantities.PiecesTable
+)
 FixedQuantity = quantities.number_forms(quantities.QuantityTable, None, quantities.ColumnTable)
 _OF_CONTROL = {
     "disturbed_by": "name of a disturbance of its capacity, the value at action +1",

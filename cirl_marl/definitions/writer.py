@@ -16,7 +16,8 @@ import tomlkit
 from cirl_marl.compartments import kind_of
 from cirl_marl.errors import NetworkError
 from cirl_marl.network import Network, declarations
-from cirl_marl.network.elements import Arc, Compartment, Control, ControlKind, Law
+from cirl_marl.network.elements import Arc, Compartment, Control, ControlKind, Law, Rate
+from cirl_marl.network.piecewise import PiecewiseRate
 from cirl_marl.network.series import Series, Value
 from cirl_marl.network.uncertainty import CAPACITY, Spread
 
@@ -133,8 +134,7 @@ class _Writer:
                 table |= {key: float(value), "unit": unit_, "source": SOURCE}
             elif isinstance(declaration, declarations.Rates):
                 table[key] = {
-                    id_: self._number(number, f"{path}.{name}.{id_}", self._named_unit(declaration, id_, part))
-                    for id_, number in value
+                    id_: self._rate(number, f"{path}.{name}.{id_}", declaration, id_, part) for id_, number in value
                 }
             elif isinstance(declaration, declarations.Quantity):
                 table[key] = self._number(value, f"{path}.{name}", self._units.get(declaration.kind(part), "1"))
@@ -165,6 +165,19 @@ class _Writer:
     def _number(self, value: Value, path: str, unit: str) -> dict[str, Any]:
         number = self._quantity(value, "1") | {"unit": unit} | _spread_keys(self._network.uncertain.get(path), value)
         return number | self._disturbance_keys(path)
+
+    def _rate(
+        self, rate: Rate, path: str, declaration: declarations.Rates, id_: str, part: Compartment
+    ) -> dict[str, Any]:
+        """Return a rate on an account, or a part of a substance."""
+        unit = self._named_unit(declaration, id_, part)
+        if not isinstance(rate, PiecewiseRate):
+            return self._number(rate, path, unit)
+        of = declaration.unit_of_subject(self._units["mass"], self._units["time"], self._control_unit(part))
+        amounts = {"to": [*map(float, rate.to)], "to_unit": of, "values": [*map(float, rate.rates)]}
+        factor = {} if rate.factor == 1.0 else {"multiplied_by": self._quantity(rate.factor, "1")}
+        spread = _spread_keys(self._network.uncertain.get(path), float(np.mean(rate.rates)))
+        return {**amounts, "unit": unit, "source": SOURCE, **factor, **spread, **self._disturbance_keys(path)}
 
     def _named_unit(self, declaration: declarations.Rates, id_: str, part: Compartment) -> str:
         if declaration.of == "substance":

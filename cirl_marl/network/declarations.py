@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, MISSING, dataclass, fields
+from dataclasses import KW_ONLY, MISSING, dataclass, fields, replace
 from datetime import date, datetime
 from enum import StrEnum
 from functools import cache, partial
@@ -67,6 +67,13 @@ class TimeDependent:
     def extremes(self) -> tuple[float, float]:
         """Lowest and highest value."""
         raise NotImplementedError
+
+
+class Scalable:
+    """What may stand for a rate on an account, with a ``factor``: the number of it that may change or be uncertain."""
+
+    __slots__ = ()
+    factor: Any
 
 
 @positional_record
@@ -154,6 +161,7 @@ class Quantity(Declaration):
 
 RATE = Quantity("an amount on an account", of="own", varies=True)
 """What each number of ``Rates`` is."""
+FACTOR = Quantity("a factor on rates", low=0.0, varies=True)
 Positive = partial(Quantity, positive=True)
 NotNegative = partial(Quantity, low=0.0)
 Share = partial(Quantity, low=0.0, high=1.0)
@@ -190,11 +198,16 @@ class Rates(Declaration):
         per = {"mass": f"({mass})", "stock": f"(({mass})*({time}))", "control": f"(({control})*({time}))"}
         return f"({amount})/{per[self.per]}"
 
+    def unit_of_subject(self, mass: str, time: str, control: str) -> str:
+        """Return the unit of what amounts are charged for in a unit of time."""
+        return {"mass": f"({mass})/({time})", "stock": mass, "control": control}[self.per]
+
     def problem(self, value: object) -> str:
         """See ``Declaration.problem``."""
         pairs = value if isinstance(value, tuple) else ()
         if not isinstance(value, tuple) or not all(isinstance(pair, tuple) and len(pair) == 2 for pair in pairs):
             return f"{{{self.of}: number, …}}, got {value!r}"
+        pairs = tuple(pair for pair in pairs if self.of != "account" or not isinstance(pair[1], Scalable))
         truths = (f"{name!r}: a number, got {number!r}" for name, number in pairs if isinstance(number, bool))
         faults = (f"{name!r}: {fault}" for name, number in pairs if (fault := self.number.problem(number)))
         return next(chain(truths, faults), "")
@@ -309,10 +322,13 @@ def bound_problems(part_: Any, prefix: str = "") -> Iterator[str]:
 
 
 def numbers(part_: Any) -> Iterator[tuple[str, Declaration, Any]]:
-    """Give name, declaration and value of every declared field; of rates each, as ``accounts.NAME``."""
+    """Give name, declaration and value of every declared field; of rates each, or its factor, as ``accounts.NAME``."""
     for name, declaration in declarations(type(part_)).items():
         if isinstance(declaration, Rates):
-            yield from ((f"{name}.{id_}", declaration.number, number) for id_, number in getattr(part_, name))
+            for id_, number in getattr(part_, name):
+                is_scalable = isinstance(number, Scalable)
+                kind = FACTOR if is_scalable else declaration.number
+                yield f"{name}.{id_}", kind, number.factor if is_scalable else number
         else:
             yield name, declaration, getattr(part_, name)
 
@@ -321,14 +337,18 @@ def with_number(part_: Any, name: str, value: Any, changes: Mapping[str, Any]) -
     """Return the ``changes`` of fields of a part, by name, with that of the number ``name`` to ``value``."""
     field, _, id_ = name.partition(".")
     if id_:
-        value = tuple({**dict(changes.get(field, getattr(part_, field))), id_: value}.items())
+        before = dict(changes.get(field, getattr(part_, field)))
+        if isinstance(before.get(id_), Scalable):
+            value = replace(before[id_], factor=value)
+        value = tuple({**before, id_: value}.items())
     return {**changes, field: value}
 
 
 def number_of(part_: Any, name: str) -> Any:
     """Return the number ``name`` of a part; see ``numbers``."""
     field, _, account = name.partition(".")
-    return dict(getattr(part_, field))[account] if account else getattr(part_, field)
+    number = dict(getattr(part_, field))[account] if account else getattr(part_, field)
+    return number.factor if isinstance(number, Scalable) else number
 
 
 def _plain_problem(value: object, hint: Any) -> str:

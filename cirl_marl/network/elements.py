@@ -30,6 +30,7 @@ from cirl_marl.network.declarations import (
     frozen_record,
 )
 from cirl_marl.network.lifetimes import SURVIVALS, Chain, chain_of
+from cirl_marl.network.piecewise import PiecewiseRate
 from cirl_marl.network.series import Series, Value, extremes
 
 
@@ -102,7 +103,10 @@ BAND_OF = Kinds("quantity", {"stock": "mass", "measure": "1"}, "flow", content_o
 
 Pair = tuple[float, float]
 NamedValues = Mapping[str, Value] | tuple[tuple[str, Value], ...]
-"""Numbers by account or substance; parts keep them as pairs, which can be hashed."""
+"""Numbers by substance; parts keep them as pairs, which can be hashed."""
+Rate = Value | PiecewiseRate
+NamedRates = Mapping[str, Rate] | tuple[tuple[str, Rate], ...]
+"""Rates by account, likewise."""
 
 
 @frozen_record
@@ -228,8 +232,8 @@ class Compartment(CheckedRecord):
     control: Annotated[Control | None, CONTROL] = None
     rule: Annotated[FeedbackRule | None, RULE] = None
     model: Annotated[CompartmentModel | None, MODEL] = None
-    accounts: Annotated[NamedValues, RATES] = ()
-    effort: Annotated[NamedValues, EFFORT] = ()
+    accounts: Annotated[NamedRates, RATES] = ()
+    effort: Annotated[NamedRates, EFFORT] = ()
     inner: Annotated[tuple[Pair, ...], INNER] = ()
     reward_scale: Annotated[float, Positive("the model's reward is divided by it")] = 1.0
 
@@ -305,7 +309,7 @@ class Node(Compartment):
             of="rate",
         ),
     ] = None
-    holding: Annotated[NamedValues, Rates("amounts by account, per mass that is held and time", per="stock")] = ()
+    holding: Annotated[NamedRates, Rates("amounts by account, per mass that is held and time", per="stock")] = ()
     content: Annotated[
         NamedValues,
         Rates(
@@ -501,7 +505,8 @@ class Account(CheckedRecord):
     Over an episode it comes to Σ_t d_t·h·(Σ_k a_k·f̄_k + Σ_i b_i·(x_i(t) + x_i(t + 1))/2 + Σ_c e_c·|u_c − n_c|), f̄ being
     mean flows, a the ``accounts`` of arcs and of the nodes that they enter, b the ``holding`` of nodes, e the
     ``effort`` of what controls u are away from their neutral values n, and d_t = (1 + r)^(−τ) the discount of what is
-    booked in the middle of an interval, τ years after the start.
+    booked in the middle of an interval, τ years after the start. Each rate may rise with what it is of
+    (``PiecewiseRate``).
     """
 
     id: str

@@ -27,8 +27,7 @@ Aim = str | Mapping[str, float]
 PER_YEAR = "/year"
 """What follows the id of an account of which there is a budget per year."""
 RateTables = tuple[Floats, Floats, Floats]
-"""What totals have of mean flows, of mean stocks and of distances of controls in some intervals; see ``Ledger.rates``.
-"""
+"""What totals have of mean flows, of mean stocks and of convex parts in some intervals; see ``Ledger.rates``."""
 
 
 class EpisodeRecord(Protocol):
@@ -142,14 +141,14 @@ class Aims:
         return table
 
     def rates(self, network: Network) -> RateTables:
-        """Return what is booked of each budget by mean flows, mean stocks and distances of controls of each interval.
+        """Return what is booked of each budget by mean flows, mean stocks and convex parts of each interval.
 
         Shapes are those of ``Ledger.rates``, with budgets in place of accounts.
         """
         ledger, accounts = Ledger(network), [budget.account for budget in self.budgets]
         counts = self.counts(ledger)[:, :, None]
-        by_flow, by_stock, by_control = (rates[accounts] * counts for rates in ledger.rates(with_discount=False))
-        return by_flow, by_stock, by_control
+        by_flow, by_stock, by_part = (rates[accounts] * counts for rates in ledger.rates(with_discount=False))
+        return by_flow, by_stock, by_part
 
     @property
     def has_years(self) -> bool:
@@ -276,8 +275,8 @@ def _check_number(subject: str, number: float) -> None:
 
 def over(rates: RateTables, intervals: range) -> RateTables:
     """Return rates of an episode over some of its intervals."""
-    (by_flow, by_stock, by_control), period = rates, slice(intervals.start, intervals.stop)
-    return by_flow[:, period], by_stock[:, period], by_control[:, period]
+    (by_flow, by_stock, by_part), period = rates, slice(intervals.start, intervals.stop)
+    return by_flow[:, period], by_stock[:, period], by_part[:, period]
 
 
 def _by_parts(rates: Floats, sums: sparse.csr_array) -> Floats:
@@ -290,7 +289,7 @@ def _by_parts(rates: Floats, sums: sparse.csr_array) -> Floats:
 def account_rows(
     lifetimes: Lifetimes, layout: Layout, initial: Floats, rates: RateTables
 ) -> tuple[sparse.csr_array, Floats]:
-    """Return what totals are of the variables of a program, exactly but for efforts, and what they have beside them.
+    """Return what totals are of the variables of a program, exactly but for convex parts, and what they have beside.
 
     Args:
         lifetimes: of the network.
@@ -301,7 +300,7 @@ def account_rows(
     Returns:
         Rows, shape (accounts, variables), and constants, shape (accounts,).
     """
-    (by_flow, by_stock, by_control), steps = rates, rates[0].shape[1]
+    (by_flow, by_stock, by_part), steps = rates, rates[0].shape[1]
     # of stocks and flows some are parts of those of the network
     by_stock, by_flow = _by_parts(by_stock, lifetimes.totals), _by_parts(by_flow, lifetimes.arc_sums)
     table = np.zeros((len(by_flow), steps, layout.size))
@@ -311,6 +310,7 @@ def account_rows(
     table[:, :-1, layout.last] += by_stock[:, 1:] / 2
     network = lifetimes.network
     controls = [network.control_rows[agent].start for agent in layout.charged_controls]
-    table[:, :, layout.effort :] = by_control[:, :, controls]
+    table[:, :, layout.effort : layout.excess] = by_part[:, :, controls]
+    table[:, :, layout.excess :] = by_part[:, :, by_part.shape[2] - (layout.size - layout.excess) :]
     start = by_stock[:, 0] @ (lifetimes.start_planned @ initial) / 2
     return sparse.csr_array(table.reshape(len(table), steps * layout.size)), start

@@ -388,14 +388,17 @@ def _solve_bound(
     circularity = plan @ circularity_weights(layout)
     levels = plan[:, layout.level : layout.imbalance]
     lifetimes = admissible.lifetimes
-    by_flow, by_stock, by_control = Ledger(lifetimes.network).rates()
-    totals, beside = account_rows(lifetimes, layout, start, (by_flow, by_stock, 0.0 * by_control))
+    ledger = Ledger(lifetimes.network)
+    by_flow, by_stock, by_part = ledger.rates()
+    totals, beside = account_rows(lifetimes, layout, start, (by_flow, by_stock, 0.0 * by_part))
     actions = normalised_actions(admissible, layout, plan, start)
     accounts = totals @ solution.plan + beside
-    if layout.charged_controls:  # variables of efforts are only at least as large as the program asks for
-        distances = np.abs(planned_deviation(lifetimes.network, admissible.agents, actions))
-        accounts = accounts + (by_control * distances.T).sum(axis=(1, 2))
-    stocks = np.concatenate([(lifetimes.start_planned @ start)[None], plan[:, layout.last]])
+    stock = np.concatenate([(lifetimes.start_planned @ start)[None], plan[:, layout.last]]) @ lifetimes.totals.T
+    flow = layout.means(plan)[1] @ lifetimes.arc_sums.T
+    if by_part.size:  # variables of convex parts are only at least as large as the program asks for
+        deviation = planned_deviation(lifetimes.network, admissible.agents, actions) if ledger.has_efforts else None
+        parts = ledger.convex_parts(flow.T, (stock[:-1] + stock[1:]).T / 2, deviation)
+        accounts = accounts + (by_part * parts.T).sum(axis=(1, 2))
     return Bound(
         network=lifetimes.network,
         agents=admissible.agents,
@@ -410,8 +413,8 @@ def _solve_bound(
         accounts=accounts,
         degree=layout.degree,
         circularity=circularity,
-        stock=stocks @ lifetimes.totals.T,
-        flow=layout.means(plan)[1] @ lifetimes.arc_sums.T,
+        stock=stock,
+        flow=flow,
         actions=actions,
         problem=problem,
         solution=solution.plan,

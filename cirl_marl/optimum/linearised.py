@@ -17,12 +17,13 @@ from scipy import sparse
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.dynamics.ledger import Ledger
 from cirl_marl.dynamics.supply import Supply
-from cirl_marl.environments.actuators import Actuators, planned_deviation
+from cirl_marl.environments.actuators import Actuators
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.aims import Aims, EpisodeRecord, RateTables, over
 from cirl_marl.optimum.planned_episodes import HasPlan
 from cirl_marl.optimum.program import LinearProgram
+from cirl_marl.optimum.step_parts import Efforts, Excesses, account_shares
 from cirl_marl.optimum.window_simulator import WindowSimulator, service_measures
 
 DIFFERENCE = 1e-6
@@ -95,13 +96,16 @@ def jacobians(plan: ActionPlan, dynamics: Dynamics, first: int = 0) -> tuple[Flo
 
 @positional_record
 class StepProgram:
-    """The program of the best step: δa, levels, imbalance and changes of efforts of each interval, lacks, excesses."""
+    """The program of the best step: δa, levels, imbalance and changes of convex parts of intervals, lacks, excesses.
+
+    Convex parts are charged distances of controls, and what rates in pieces have excesses of.
+    """
 
     problem: Annotated[LinearProgram, "the program"]
     scale: Annotated[Floats, "measure of each variable, shape (variables,)"]
     origin: Annotated[Floats, "its variables if nothing changes, likewise"]
     action: Annotated[Integers, "columns of δa, shape (steps, entries)"]
-    effort: Annotated[Integers, "columns of what charged distances of controls change by, shape (steps, controls)"]
+    part: Annotated[Integers, "columns of what convex parts change by, shape (steps, parts)"]
     level: Annotated[Integers, "columns of the levels, shape (steps, services)"]
     lack: Annotated[Integers, "columns of what services lack and budgets are exceeded by, (services + budgets,)"]
     measured: Annotated[Integers, "interval, and row of ``measure``, of each of the first rows of G, shape (rows, 2)"]
@@ -120,49 +124,13 @@ class StepProgram:
         step, row = self.measured.T
         before, after = (np.concatenate([each.stock, each.flow], axis=1) @ self.measure.T for each in (run, trial))
         moves = np.zeros(len(values))
-        moves[self.action], moves[self.effort] = values[self.action], values[self.effort]
+        moves[self.action], moves[self.part] = values[self.action], values[self.part]
         limits = self.problem.under_to.copy()
         correction = (after - before)[step, row] + self.problem.under[: len(row)] @ moves
         limits[: len(row)] += np.where(np.isin(row, self.contents), 0.0, correction)
         first = len(limits) - len(self.aims.budgets)
         limits[first:] -= self.aims.totals(trial) - self.aims.totals(run) - self.problem.under[first:] @ moves
         return replace(self, problem=replace(self.problem, under_to=limits))
-
-
-@positional_record
-class _Efforts:
-    """Controls of which something is charged for the distance from their neutral values, d + half·δa."""
-
-    entries: Annotated[Integers, "of stacked actions, shape (controls,)"]
-    controls: Annotated[Integers, "these among all controls, likewise"]
-    away: Annotated[Floats, "d, shape (steps, controls)"]
-    half: Annotated[Floats, "half the range of each, likewise"]
-
-    @classmethod
-    def of(cls, plan: ActionPlan, rates: Floats, first: int) -> _Efforts:
-        """Take those that act in a plan, which begins in interval ``first``.
-
-        ``rates`` are per distance, shape (accounts, steps, controls).
-        """
-        network, actions = plan.network, plan.actions
-        acting = Actuators(network, plan.agents or None, len(actions)).control_rows
-        is_charged = np.append(rates.any(axis=(0, 1)), False)  # there are no columns if nothing is charged
-        entries = np.flatnonzero(is_charged[np.minimum(acting, len(is_charged) - 1)])
-        controls = acting[entries]
-        low, _, high = network.control_bounds[:, controls, first : first + len(actions)]
-        away = planned_deviation(network, plan.agents, actions, first)[controls].T
-        return cls(entries, controls, away, (high - low).T / 2)
-
-    def rows(self, sign: float, action: Integers, effort: Integers, count: int) -> sparse.csr_array:
-        """Return ±half·δa − δe, of columns δa and δe of ``count``, which is at most ``limits``."""
-        places, ends = np.arange(effort.size), np.ones(effort.size)
-        values = np.concatenate([sign * self.half.ravel(), -ends])
-        columns = np.concatenate([action.ravel(), effort.ravel()])
-        return sparse.csr_array((values, (np.tile(places, 2), columns)), (effort.size, count))
-
-    def limits(self, sign: float) -> Floats:
-        """Return |d| ∓ d."""
-        return np.asarray(np.abs(self.away) - sign * self.away).ravel()
 
 
 def step_program(
@@ -210,8 +178,14 @@ def step_program(
     if rates is None:
         rates = over(Ledger(network).rates(), intervals), over(plan.aims.rates(network), intervals)
     rates_of_accounts, rates_of_budgets = rates
-    efforts = _Efforts.of(plan, rates_of_accounts[2], first)
-    size = entries + services + 1 + len(efforts.entries)
+    ledger, controls = Ledger(network), rates_of_accounts[2].shape[2]
+    controls -= len(ledger.excesses)
+    is_charged = np.asarray(rates_of_accounts[2][:, :, :controls].any(axis=(0, 1)))
+    is_charged |= ledger.excess_subjects[2].any(axis=0)
+    efforts = Efforts.of(plan, is_charged, first)
+    excesses = Excesses.of(ledger, dynamics, efforts, plan.initial, state)
+    count_efforts = len(efforts.entries)
+    size = entries + services + 1 + count_efforts + len(ledger.excesses)
     level, imbalance, count = entries, entries + services, size * steps + services + len(limits)
     step_low, step_high = np.maximum(-trust, -1 - plan.actions), np.minimum(trust, 1 - plan.actions)
     furthest = np.maximum(-step_low, step_high)
@@ -219,17 +193,23 @@ def step_program(
     low *= 1.0 + margin
     measure, by_stage, imbalances = _measures(plan, dynamics)
     contents = _contents(plan, dynamics)
-    accounts = _account_shares(rates_of_accounts, dynamics)
+    accounts = account_shares(rates_of_accounts, dynamics)
     weights = -plan.aims.objective(-_circularity_cost(plan, dynamics), accounts)
     cost, cost_later, spent = np.zeros(count), np.zeros(count), np.zeros((len(limits), count))
-    budgets = _account_shares(rates_of_budgets, dynamics)
+    budgets = account_shares(rates_of_budgets, dynamics)
     columns = size * np.arange(steps)[:, None] + np.arange(size)
-    effort = columns[:, imbalance + 1 :]
-    cost[effort] = -plan.aims.objective(np.zeros(effort.shape), rates_of_accounts[2][:, :, efforts.controls])
-    spent[:, effort] = rates_of_budgets[2][:, :, efforts.controls]
+    part = columns[:, imbalance + 1 :]
+    effort, part_bounds = part[:, :count_efforts], slice(size - len(ledger.excesses), size)
+    parts = np.append(efforts.controls, np.arange(controls, rates_of_accounts[2].shape[2]))
+    cost[part] = -plan.aims.objective(np.zeros(part.shape), rates_of_accounts[2][:, :, parts])
+    spent[:, part] = rates_of_budgets[2][:, :, parts]
+    bounds = np.tile(np.array([0.0, np.inf]), (steps, size, 1))
+    before = np.empty((len(state[0]), 0))
     rows: list[sparse.csr_array] = []
     rights: list[Floats] = []
     measured: list[Integers] = []
+    rows_of_parts: list[sparse.csr_array] = []
+    rights_of_parts: list[Floats] = []
     for t, response in enumerate(_responses(*slopes[:2])):
         past = columns[: t + 1, :entries].ravel()
         cost[past] += weights[t] @ response
@@ -258,6 +238,15 @@ def step_program(
         rows.append(sparse.csr_array((block.data, places, block.indptr), (len(near), count)))
         rights.append(limit[near])
         measured.append(np.stack([np.full_like(near, t), near], axis=1))
+        if part.shape[1] > count_efforts:
+            moves = furthest[: t + 1].ravel(), efforts.half[t] * furthest[t, efforts.entries]
+            block, room, bounds[t, part_bounds] = excesses.rows(t, response, before, *moves)
+            places = np.append(past, part[t])[block.indices]
+            rows_of_parts.append(sparse.csr_array((block.data, places, block.indptr), (len(room), count)))
+            rights_of_parts.append(room)
+            before = response
+    rows += rows_of_parts
+    rights += rights_of_parts
     for sign in (1.0, -1.0):
         rows.append(efforts.rows(sign, columns[:, efforts.entries], effort, count))
         rights.append(efforts.limits(sign))
@@ -268,10 +257,10 @@ def step_program(
     # what is booked − excess ≤ budget
     spent[:, size * steps + services :] = -np.eye(len(limits))
     rows.append(sparse.csr_array(spent))
-    bounds = np.tile(np.array([0.0, np.inf]), (steps, size, 1))
     bounds[:, :entries] = np.stack([step_low, step_high], axis=2)
     bounds[:, level:imbalance, 1] = 1.0
-    bounds[:, imbalance + 1 :] = np.stack([-np.abs(efforts.away), efforts.half * furthest[:, efforts.entries]], axis=2)
+    most = efforts.half * furthest[:, efforts.entries]
+    bounds[:, imbalance + 1 : part_bounds.start] = np.stack([-np.abs(efforts.away), most], axis=2)
     lower, upper = np.concatenate([bounds.reshape(-1, 2), np.tile([0.0, np.inf], (services + len(limits), 1))]).T
     if plan.service_weight is not None:
         cost /= network.objective.circularity_scale
@@ -294,9 +283,10 @@ def step_program(
     )
     net_flow = np.abs(run.flow @ imbalances)[:, None]
     largest = max(float(net_flow.max()), network.objective.circularity_scale)
-    unchanged = np.zeros(effort.shape)
+    unchanged = np.zeros(part.shape)
     origin = np.concatenate([np.zeros((steps, entries)), run.levels[0].T, net_flow, unchanged], axis=1)
     scales = [np.tile(np.append(np.ones(entries + services), largest), (steps, 1)), np.maximum(efforts.half, TINY)]
+    scales.append(np.tile(ledger.amounts.T, (steps, 1)))
     size_of_excess = np.maximum(np.abs(plan.aims.totals(run)), np.abs(limits))
     short = [np.maximum(demand - run.levels[0].mean(axis=1), 0.0), np.maximum(plan.aims.totals(run) - limits, 0.0)]
     return StepProgram(
@@ -304,7 +294,7 @@ def step_program(
         np.concatenate([np.concatenate(scales, axis=1).ravel(), np.ones(services), size_of_excess]),
         np.concatenate([origin.ravel(), *short]),
         columns[:, :entries],
-        effort,
+        part,
         columns[:, level:imbalance],
         np.arange(size * steps, count),
         np.concatenate(measured),
@@ -373,14 +363,3 @@ def _circularity_cost(plan: ActionPlan, dynamics: Dynamics) -> Floats:
     of_substances = np.zeros(len(network.arcs) * (dynamics.rows.components - 1))
     cost = np.concatenate([np.zeros(dynamics.rows.nodes.stop), -counted / steps, of_substances])
     return np.broadcast_to(cost, (steps, len(cost)))
-
-
-def _account_shares(rates: RateTables, dynamics: Dynamics) -> Floats:
-    """Return the share of (x', f̄) of each interval in what is booked at some rates, (rates, steps, stocks + arcs)."""
-    by_flow, by_stock, _ = rates
-    by_stock[:, :-1] += by_stock[:, 1:]  # a stock ends one interval and begins the next
-    stages = np.zeros((by_stock.shape[2], dynamics.rows.nodes.stop))
-    for store in range(len(stages)):
-        stages[store, np.atleast_1d(dynamics.rows.stages.get(store, store))] = 1.0
-    of_substances = np.zeros((*by_flow.shape[:2], by_flow.shape[2] * (dynamics.rows.components - 1)))
-    return np.concatenate([by_stock / 2 @ stages, by_flow, of_substances], axis=2)

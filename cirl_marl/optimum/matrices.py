@@ -51,7 +51,7 @@ class Layout:
     For each piece X_i, F_i and Z_i for i = 0 … d, then the stocks at its end; after the last piece, the levels, the
     imbalance and the free valves. Of a node that stores nothing X_i is its throughput, and there is no stock at the
     end. Z_i = v·X_i is what the valve of a node lets through to several outflows. Moments are counted through all
-    pieces. What controls are away from their neutral values comes last, if something is charged for it.
+    pieces. What controls are away from their neutral values, and excesses, come last, if something is charged for them.
 
     Attributes:
         network: whose variables they are.
@@ -80,6 +80,7 @@ class Layout:
         free_valve: first of the valves v themselves.
         charged_controls: agents that pay for the effort of their controls.
         effort: first of what these are away from their neutral values.
+        excess: first of the excesses, which follow them; see ``Ledger``.
         size: variables of an interval.
     """
 
@@ -94,10 +95,11 @@ class Layout:
         coarse: bool,
         has_end_flows: bool = False,
         charged_controls: tuple[str, ...] = (),
+        excesses: int = 0,
     ) -> None:
-        """Lay the variables out; the arguments are the attributes of the same names."""
+        """Lay the variables out; arguments are the attributes of the same names, or count them."""
         self.network, self.pieces, self.degree = network, pieces, degree
-        self.charged_controls = charged_controls
+        self.charged_controls, self._excesses = charged_controls, excesses
         self.valves, self.free_valves = valves, free_valves
         self.coarse, self.has_end_flows = coarse, has_end_flows
         self.moments = range(pieces * (degree + 1))
@@ -124,7 +126,8 @@ class Layout:
         self.imbalance = self.level + len(self.network.services)
         self.free_valve = self.imbalance + 1
         self.effort = self.free_valve + len(self.free_valves)
-        self.size = self.effort + len(self.charged_controls)
+        self.excess = self.effort + len(self.charged_controls)
+        self.size = self.excess + self._excesses
 
     def with_constant_parts(self, nodes: Integers, arcs: Integers) -> Layout:
         """Return the layout in which constant parts of some throughputs and flows are variables too."""

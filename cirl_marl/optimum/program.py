@@ -35,6 +35,7 @@ from cirl_marl.optimum.constraints import (
 )
 from cirl_marl.optimum.content_ranges import check_contents
 from cirl_marl.optimum.effort import charged_controls, effort_rows, largest_distances
+from cirl_marl.optimum.excess import excess_rows
 from cirl_marl.optimum.matrices import BEFORE, NOW, ChainedRows, IntervalCache, Layout, ProgramRows, RowParts
 from cirl_marl.optimum.mixtures import content_rows, mixture_rows
 from cirl_marl.optimum.quasi_steady import decay_rows, end_laws, has_fast_stocks, quasi_steady_rows
@@ -130,7 +131,9 @@ class Programs:
         self.system = system
         constant_shares = constant_shares and not hold_controls and layout is None
         self._transit: Transit | None = None
-        self.layout = layout = layout or _layout(admissible, system.substeps, merge_pieces, degree, large)
+        self._ledger = Ledger(lifetimes.network)
+        excesses = len(self._ledger.excesses)
+        self.layout = layout = layout or _layout(admissible, system.substeps, merge_pieces, degree, large, excesses)
         if constant_shares and layout.size * len(admissible.kinds) <= LARGE:
             transit = Transit(admissible, system.substeps)
             if len(transit.splits):
@@ -230,13 +233,14 @@ class Programs:
             mixture_rows(admissible, reach, intervals, rows)
             content_rows(admissible, high.reshape(steps, -1), intervals, rows)
         effort_rows(admissible, reach, intervals, rows)
+        excess_rows(lifetimes, self._ledger, initial, high.reshape(steps, -1), rows)
         from_start = rows.matrices()[0]
         from_start.eliminate_zeros()
         lifetime_rows, lifetime_limits = lifetimes.rows(layout, initial, intervals)
         blocks, limits = [under, from_start, lifetime_rows], [under_to, rows.limits(), lifetime_limits]
         cost, constant = np.tile(-self._weights / steps, steps), self._constant
         if aims is not None and not aims.is_circular:
-            rates = over(Ledger(lifetimes.network).rates(), intervals)
+            rates = over(self._ledger.rates(), intervals)
             totals, beside = account_rows(lifetimes, layout, initial, rates)
             cost, constant = -aims.objective(-cost, totals.toarray()), float(aims.objective(constant, beside))
         if aims is not None and aims.budgets:
@@ -286,7 +290,12 @@ def possible_range(
 
 
 def _layout(
-    admissible: Admissible, substeps: int, merge_pieces: bool | None, degree: int, large: int | None = None
+    admissible: Admissible,
+    substeps: int,
+    merge_pieces: bool | None,
+    degree: int,
+    large: int | None = None,
+    excesses: int = 0,
 ) -> Layout:
     network, nodes = admissible.network, len(admissible.network.nodes)
     pieces = admissible.lifetimes.pieces(degree, substeps) if admissible.lifetimes.whole else substeps
@@ -295,7 +304,7 @@ def _layout(
     movable = (admissible.valve[0] < admissible.valve[1]).any(axis=0)
     valves = np.flatnonzero(movable & ((exits > 1) | (exits > 0) & (schedules > 0)))
     free_valves = np.flatnonzero(movable & (exits > 0) & (schedules > 0))
-    make = partial(Layout, network, charged_controls=charged_controls(admissible))
+    make = partial(Layout, network, charged_controls=charged_controls(admissible), excesses=excesses)
     fine = make(pieces, degree, valves, free_valves, coarse=pieces < substeps)
     variables, entries = fine.size * network.episode.horizon, admissible.lifetimes.entries(fine)
     fewer, large = 0.0 if merge_pieces else float(pieces), LARGE if large is None else large
@@ -338,7 +347,7 @@ def _box(
     high[:, layout.imbalance] = most @ weights
     free_valves = slice(layout.free_valve, layout.effort)
     low[:, free_valves], high[:, free_valves] = valve[:, :, layout.free_valves]
-    high[:, layout.effort :] = largest_distances(admissible, layout.charged_controls)[period]
+    high[:, layout.effort : layout.excess] = largest_distances(admissible, layout.charged_controls)[period]
     return low.ravel(), high.ravel()
 
 

@@ -438,11 +438,12 @@ class WindowPlanner:
         aims, size = futures[0].aims, network.objective.circularity_scale
         self._scale = 1.0 if service_weight is not None else size
         if aims.charges:
-            rates = Ledger(network).rates()
-            scales = [np.array([part.scale for part in parts]) for parts in (network.arcs, network.stores)]
-            low, neutral, high = network.control_bounds
-            scales.append(np.maximum(high - neutral, neutral - low).max(axis=1)[: rates[2].shape[2]])
-            accounts = sum((np.abs(rate) @ scale).sum(axis=1) for rate, scale in zip(rates, scales, strict=True))
+            ledger, (low, neutral, high) = Ledger(network), network.control_bounds
+            scales = [np.array([[part.scale] for part in parts]) for parts in (network.arcs, network.stores)]
+            furthest = np.maximum(high - neutral, neutral - low).max(axis=1)[:, None]
+            scales.append(ledger.convex_parts(scales[0], scales[1], furthest if ledger.has_efforts else None))
+            pairs = zip(ledger.rates(), scales, strict=True)
+            accounts = sum((np.abs(rate) @ scale[:, 0]).sum(axis=1) for rate, scale in pairs)
             self._scale = size = aims.size(network, np.asarray(accounts))
         slack_count = len(aims.budgets) + len(network.services)
         self.first_price = np.full(slack_count, FIRST_PRICE * size)

@@ -35,6 +35,7 @@ PARTS: dict[str, tuple[Any, str]] = {
     **{kind: (table, f'`[disturbances.NAME]` with `kind = "{kind}"`') for kind, table in schema.DISTURBANCES.items()},
     "correlation": (schema.CorrelationTable, "`[disturbance_correlation]`"),
     "quantity": (quantities.QuantityTable, "Every number with a unit"),
+    "pieces": (quantities.PiecesTable, "For a rate on an account"),
     "series": (quantities.SeriesTable, "For a quantity; in a control without `unit` and `source`, which are its own"),
     "column": (quantities.ColumnTable, "For a quantity; in a control without `unit` and `source`, which are its own"),
     "range": (quantities.Range, "`initial` of a node"),
