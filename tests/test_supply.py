@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from conftest import random_network, with_substances
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -355,6 +357,45 @@ def test_supplies_cost_few_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
         env.advance(rng.uniform(-1, 1, (len(env.agents), 2)))
     assert terms.count(env.dynamics.terms) == 20
     assert len(terms) == 3 * 20
+
+
+@given(seed=st.integers(0, 2**31), lifetimes=st.booleans(), substances=st.booleans())
+@settings(max_examples=25)
+def test_estimates_of_stocks_are_what_all_terms_come_to(seed: int, lifetimes: bool, substances: bool) -> None:
+    """With every term an estimate is the interval; with few it is what the flows of as many terms leave."""
+    network = random_network(seed, 6, 14, lifetimes=lifetimes)
+    network = with_substances(network, seed, batches=True) if substances else network
+    env = MultiAgentVectorEnv(network, num_envs=3)
+    env.reset(seed=seed)
+    state = env.physical
+    done = env.dynamics.advance(state.stock, state.inner, env.dynamics.neutral_in(state.step), state.step)
+    near = partial(np.testing.assert_allclose, rtol=0, atol=1e-12 * done.stock.max())
+    stocks, moved_mass = estimate(env, env.dynamics.terms, flows=False)
+    near(stocks, done.stock)
+    assert env.dynamics.taylor is not None
+    assert (moved_mass is None) is not (env.dynamics.taylor.pulls or len(env.dynamics.batches.lines) > 0)
+    near(estimate(env, env.dynamics.terms, flows=True)[1], done.moved_mass)
+
+
+def estimate(env: MultiAgentVectorEnv, terms: int, *, flows: bool) -> tuple[Floats, Floats | None]:
+    """Return what the next interval is estimated to do."""
+    dynamics, state = env.dynamics, env.physical
+    controls = dynamics.neutral_in(state.step)
+    rate = dynamics.rate(controls, state.step)
+    routes = dynamics.routing.routes(rate)
+    inputs = state.stock, state.inner, controls, state.step, None, routes, rate
+    return dynamics.estimate(*inputs, terms=terms, flows=flows)
+
+
+@pytest.mark.parametrize("terms", [2, 6])
+def test_few_terms_leave_what_their_flows_leave(terms: int) -> None:
+    """Where they overdraw no stock; elsewhere it is empty."""
+    env = MultiAgentVectorEnv("steel_japan", num_envs=2)
+    env.reset(seed=0)
+    np.testing.assert_allclose(estimate(env, terms, flows=False)[0], estimate(env, terms, flows=True)[0], rtol=1e-12)
+    env = MultiAgentVectorEnv(with_substances(random_network(8080, 6, 14), 8080), num_envs=3)
+    env.reset(seed=8080)
+    assert estimate(env, terms, flows=False)[0].min() >= 0.0
 
 
 def reserve(stock: float, most: float, demand: float = 47.0, export: float = 0.0) -> Network:

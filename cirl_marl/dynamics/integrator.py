@@ -138,17 +138,24 @@ class Dynamics(FlowLaws):
         rate: Floats,
         *,
         terms: int,
-    ) -> tuple[Floats, Floats]:
-        """Return roughly what an interval does, by so many ``terms`` of the exact solver's series; mass is conserved.
+        flows: bool,
+    ) -> tuple[Floats, Floats | None]:
+        """Return roughly what an interval does, by so many ``terms`` of the exact solver's series.
 
-        The other arguments are those of ``advance``.
+        The other arguments are those of ``advance``; ``flows`` says whether what arcs carry is asked for.
 
         Returns:
             stocks after the interval, shape (masses, B), and the mass moved along each arc, shape (arcs, B).
         """
         self._limit(rate, stock, step, factors)
-        stock, _, total, *_ = self._hold(stock, inner, controls, rate, routes, step, terms)
-        return stock, self.of_arcs(total)[0]
+        if flows or self.batches.lines or self.taylor is None or self.taylor.pulls:
+            stock, _, total, *_ = self._hold(stock, inner, controls, rate, routes, step, terms)
+            return stock, self.of_arcs(total)[0]
+        stock = self._move_slots(stock, rate)
+        for _ in range(self.substeps):
+            stock = self.taylor.end(stock, routes, terms, self.scheduled.cut(stock, rate))
+            np.maximum(stock, 0.0, out=stock)  # few terms may overdraw it
+        return stock, None
 
     def _hold(
         self,
@@ -161,9 +168,7 @@ class Dynamics(FlowLaws):
         terms: int | None,
     ) -> Held:
         """Go through an interval."""
-        if self.slots is not None:
-            stock = self.slots.shift_slots(stock)
-            self.slots.set_outflows(stock, rate)
+        stock = self._move_slots(stock, rate)
         actual_rate, batch_start = rate, None
         if self.batches.lines and step is not None:
             stock = stock.copy()
@@ -216,6 +221,13 @@ class Dynamics(FlowLaws):
         except ArithmeticError as error:
             raise CirlError(f"network '{self.network.name}': {error}") from error
         return rate, through, done[0]
+    def _move_slots(self, stock: Floats, rate: Floats) -> Floats:
+        """Return the masses once slots have moved on, and set the rates of what comes out of them, in place."""
+        if self.slots is None:
+            return stock
+        stock = self.slots.shift_slots(stock)
+        self.slots.set_outflows(stock, rate)
+        return stock
 
     def of_arcs(self, flow: Floats) -> tuple[Floats, Floats]:
         """Return what the arcs of the network carry, of all that is moved, shape (arcs of the simulator, B).
@@ -280,9 +292,7 @@ class Dynamics(FlowLaws):
         """Return the flows at the start of an episode, cut to what the donors hold, mass/time; see ``of_arcs``."""
         first = np.zeros(stock.shape[1], dtype=np.intp)
         rate = self.rate_of_components(stock, controls, first, factors)
-        if self.slots is not None:
-            stock = self.slots.shift_slots(stock)
-            self.slots.set_outflows(stock, rate)
+        stock = self._move_slots(stock, rate)
         if self.physical:
             rate = self.scheduled.cut(stock, rate)
         if self.orders:

@@ -65,7 +65,7 @@ class Supply:
         demand: D in each interval, shape (services, horizon).
         demand_factors: factors on it.
         drawn: factors on the bounds of ``rows``.
-        measure: q of stocks and mean flows.
+        measures: q of stocks, and of mean flows.
         arrivals: A.
         duration: by which A is multiplied, an interval or 1.
     """
@@ -91,15 +91,19 @@ class Supply:
             {row: numbers[service_.id] for row, service_ in enumerate(services) if service_.id in numbers}
         )
         self.drawn = ControlFactors(network, dynamics.factors.ranges, self.rows)
-        stores, rows, columns = len(network.stores), [], []
+        of_stocks: list[tuple[int, int]] = []
+        of_flows: list[tuple[int, int]] = []
         for row, service in enumerate(services):
             if service.quantity == "stock":
-                read = [network.node_index[service_] for service_ in service.providers]
+                of_stocks += [(row, network.node_index[node]) for node in service.providers]
             else:
-                read = [stores + int(k) for k in network.service_arcs(service)]
-            rows += [row] * len(read)
-            columns += read
-        self.measure = RowSum(rows, columns, 1.0, (len(services), stores + len(network.arcs)))
+                of_flows += [(row, int(k)) for k in network.service_arcs(service)]
+        widths = (of_stocks, len(network.stores)), (of_flows, len(network.arcs))
+        self.measures = tuple(
+            RowSum([row for row, _ in places], [column for _, column in places], 1.0, (len(services), width))
+            for places, width in widths
+        )
+        self._reads_flows = bool(of_flows)
         self.indices: Integers = np.array([network.arc_index[arc] for arc in self.arcs], dtype=np.intp)
         self.arrivals = Arrivals(dynamics, services, self.indices)
         self._interval = interval = network.episode.control_interval
@@ -203,7 +207,8 @@ class Supply:
                     done = part if done is None or len(copies) == batch else _with_copies(done, copies, part)
                     base[:, copies] = self._quantities(part.stock, part.moved_mass)
                 else:
-                    base[:, copies] = self._quantities(*dynamics.estimate(*inputs, terms=terms))
+                    estimate = dynamics.estimate(*inputs, terms=terms, flows=self._reads_flows)
+                    base[:, copies] = self._quantities(*estimate)
                 shortage = demand - base
                 gap = np.where(np.where(shortage > 0, supply < range_.most, supply > 0), np.abs(shortage), 0.0)
                 is_wrong = open_ & (gap > CLOSE * demand).any(axis=0)
@@ -282,9 +287,11 @@ class Supply:
         slope = np.divide(change, shift, out=np.zeros_like(change), where=shift != 0)
         return np.ascontiguousarray(slope.reshape(services, batch, services).transpose(1, 0, 2))
 
-    def _quantities(self, stock: Floats, moved_mass: Floats) -> Floats:
+    def _quantities(self, stock: Floats, moved_mass: Floats | None) -> Floats:
         """Return what the services measure at the end of an interval, shape (services, B)."""
-        return self.measure(np.concatenate([self._dynamics.rows.stocks(stock), moved_mass / self._interval]))
+        of_stocks, of_flows = self.measures
+        measured = of_stocks(self._dynamics.rows.stocks(stock))
+        return measured if moved_mass is None else of_flows.add_to(measured, moved_mass / self._interval)
 
 
 class SupplyRange:

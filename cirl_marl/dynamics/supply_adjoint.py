@@ -26,7 +26,7 @@ class SupplyAdjoint:
     def __init__(self, supply: Supply, adjoint: Adjoint) -> None:
         """Take the supplies, and the adjoint of intervals in which controls are given."""
         self._supply, self._adjoint = supply, adjoint
-        self._measured = supply.measure.transpose()
+        self._measures = [measure.transpose() for measure in supply.measures]
 
     def pull_back(
         self,
@@ -84,7 +84,7 @@ class SupplyAdjoint:
     def _by_measures(self, worth: Floats) -> tuple[Floats, Floats]:
         """Return the adjoints of masses and of moved mass for what a unit that each service measures is worth."""
         dynamics = self._adjoint.dynamics
-        stocks, flow = np.split(self._measured(worth), [len(dynamics.network.stores)])
+        stocks, flow = (measure(worth) for measure in self._measures)
         return dynamics.rows.masses_adjoint(stocks), flow / dynamics.network.episode.control_interval
 
     def _with_bounds(

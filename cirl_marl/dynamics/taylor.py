@@ -36,10 +36,10 @@ class Taylor:
         self._laws, self._substep = laws, substep
         self.terms = self._number()
         # Horner from the innermost term: h/K, …, h/3, h/2
-        factors = [substep / k for k in range(self.terms, 1, -1)]
+        self._factors = [substep / k for k in range(self.terms, 1, -1)]
         self.pulls = any(arc.law is Law.RECIPIENT for arc in laws.staged_network.arcs)
-        self.horner = [laws.incidence.scaled_by(factor) for factor in factors]
-        self._shortcut = KronReduction(laws, factors) if laws.routing.nodes else None
+        self.horner = [laws.incidence.scaled_by(factor) for factor in self._factors]
+        self._shortcut = KronReduction(laws) if laws.routing.nodes else None
         network, routing, stores = laws.staged_network, laws.routing, laws.rows.nodes.stop
         # throughputs stand below the masses, and drive what leaves nodes without stock
         self.driver = laws.driver.copy()
@@ -80,13 +80,20 @@ class Taylor:
         Flows given in ``imposed_flow``, shape (arcs, B), hold whatever the state; NaN where the flow law does.
         """
         if self._shortcut is not None and routes is not None and imposed_flow is None:
-            transfer = self.flow(self._shortcut.mean(stock, routes, terms, rate), routes, rate)
+            mean = self._shortcut.series(stock, routes, self._factors[-(terms or self.terms) :], rate)
+            transfer = self.flow(mean, routes, rate)
         else:
             transfer = self._mean_flow(stock, routes, terms, rate, imposed_flow)
         transfer *= self._substep
         if self.pulls:
             np.maximum(transfer, 0.0, out=transfer)  # the mean of an overdrawn stock may be negative
         return transfer
+
+    def end(self, stock: Floats, routes: IntervalRoutes | None, terms: int, rate: Floats) -> Floats:
+        """Return the masses at the substep's end by so many ``terms``, x + h·ẋ(ȳ), shape (masses, B), without flows."""
+        if self._shortcut is None or routes is None:
+            return self._laws.incidence.add_to(stock.copy(), self.moved_mass(stock, routes, terms, rate))
+        return self._shortcut.series(stock, routes, [*self._factors[-terms:], self._substep], rate)
 
     def flow(self, masses: Floats, routes: IntervalRoutes | None, rate: Floats) -> Floats:
         """Return the flows at ``masses``, those that are passed on too, shape (arcs, B)."""
@@ -128,7 +135,7 @@ class Taylor:
 
 
 class KronReduction:
-    """The mean of the state over a substep, in networks with nodes that store nothing, without the flows in between.
+    """The series of a substep, in networks with nodes that store nothing, without the flows in between.
 
     Only ẋ matters inside the series. It follows from x in four steps, each over all copies: the flows whose rates
     differ from copy to copy; what of them and of the others comes to stocks and to kept nodes (``routing``), a sum with
@@ -141,9 +148,8 @@ class KronReduction:
     shares of these that differ, constant nodes on the way again, and what masses change by.
     """
 
-    def __init__(self, laws: FlowLaws, factors: Sequence[float]) -> None:
-        """Compile the sums; ``factors`` are those of the derivatives in the series, from the innermost."""
-        self._factors = factors
+    def __init__(self, laws: FlowLaws) -> None:
+        """Compile the sums."""
         routing, nodes, masses = laws.routing, laws.routing.nodes, laws.rows.masses
         outer = laws.staged_network.donors < laws.rows.nodes.stop
         place = {i: n for n, i in enumerate(routing.detours.kept_nodes)}
@@ -188,8 +194,15 @@ class KronReduction:
         self._inflow_matrix = square_matrix(inflow_rows, rows[0] | rows[1] | rows[2] | rows[3] | rows[8], size)
         self._spread = square_matrix(spread, rows[5] | rows[6] | rows[7] | rows[8], size)
 
-    def mean(self, stock: Floats, routes: IntervalRoutes, terms: int | None, rate: Floats) -> Floats:
-        """Return the mean of the masses over the substep for constant ``rate``, shape (masses, B)."""
+    def series(self, stock: Floats, routes: IntervalRoutes, factors: Sequence[float], rate: Floats) -> Floats:
+        """Return x + a·ẋ(x + b·ẋ(x + …)) for constant ``rate``, shape (masses, B).
+
+        Args:
+            stock: x, shape (masses, B).
+            routes: by the shares of the interval.
+            factors: …, b, a, from the innermost.
+            rate: shape (arcs, B).
+        """
         rates, chain_rates = rate.take(self._varying_flows, 0), rate.take(self._chain_flows, 0)
         shares, chain_flow = routes.rate.take(self._varying_arcs, 0), np.empty_like(chain_rates)
         work: Floats = np.empty((self._change.stop, stock.shape[1]))
@@ -197,7 +210,7 @@ class KronReduction:
         flows, passing, sent_rows = work[self._flows], work[self._passing], work[self._sent_rows]
         varying_rows, change, sums = work[self._varying_rows], work[self._change], [work[rows] for rows in self._sums]
         mean[...] = stock
-        for factor in self._factors[-(terms or len(self._factors)) :]:
+        for factor in factors:
             mean.take(self._drivers, 0, out=flows, mode="clip")  # "raise" would copy
             flows *= rates
             for rows in sums:
