@@ -16,7 +16,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl import CirlError, DefinitionError, LearnerError, RecipeError
-from cirl_marl.learners.interface import Trained, prepare, resume, train
+from cirl_marl.learners.checkpoint import observation_statistics
+from cirl_marl.learners.interface import Trained, _learn_first, prepare, resume, train
 from cirl_marl.learners.learner import Learner, load_acting_learner
 from cirl_marl.learners.recipe import Recipe, load_recipe
 from cirl_marl.learners.run_directory import RunDirectory
@@ -308,6 +309,106 @@ def test_one_recipe_serves_several_seeds(first: tuple[Training, Path], tmp_path:
         prepare("copper_net", asked, seed=4, **OPTIONS)
 
 
+@pytest.fixture
+def recipe_first(tmp_path: Path) -> Path:
+    """Return a recipe of exact gradients for one that begins with it."""
+    path = tmp_path / "guess.toml"
+    path.write_text(
+        "name = 'guess'\ntitle = 'a first guess'\n[run]\nengine = 'gradients'\nsteps = 24\nenvs = 2\nevaluations = 3\n"
+        "episodes = 2\n[environment]\nreward = 'team'\ncircularity = 'mean'\n[learner]\nalgorithm = 'PPO'\n"
+        "parameters = { learning_rate = 0.1, policy_kwargs = { net_arch = [8] } }\n"
+    )
+    return path
+
+
+def after(path: Path, **others: Any) -> Recipe:
+    """Return a recipe with critics of the whole network, small noise, and a first guess by the recipe of a file."""
+    exploring = PPO | {"policy_kwargs": {"net_arch": [8], "log_std_init": -1.5}}
+    central = {"policy": "CentralCriticPolicy", "parameters": exploring} | others
+    return recipe(start={"recipe": str(path)}, **central)
+
+
+def test_what_acts_is_that_of_a_recipe_that_learnt_first(recipe_first: Path, tmp_path: Path) -> None:
+    """The best it found, to the bit, with statistics of observations; critics and exploration are those of now."""
+    train("copper_net", str(recipe_first), seed=7, directory=tmp_path / "first", **OPTIONS)
+    source = RunDirectory(tmp_path / "first")
+    groups = {group.name: group for group in source.groups()}
+    found, fresh = (prepare("copper_net", after(recipe_first), seed=7, **OPTIONS) for _ in range(2))
+    _learn_first(found, "cpu")
+    for name in AGENTS:
+        acted = load_acting_learner(source.acting_checkpoint, groups[name], source.make_env(1))
+        old, new, plain = map(weights, (acted, found.learners[name], fresh.learners[name]))
+        acting = {key for key in new if "policy_net" in key or key.startswith("action_net")}
+        assert len(acting) == 4 and all(torch.equal(new[key], old[key]) for key in acting)
+        assert all(torch.equal(new[key], plain[key]) for key in new.keys() - acting)
+        assert not any(torch.equal(new[key], plain[key]) for key in acting)
+        before, now = (observation_statistics(each.env)["observation"] for each in (acted, found.learners[name]))  # type: ignore[arg-type]
+        np.testing.assert_array_equal([before.mean, before.var], [now.mean, now.var])
+        origin = found.config.origins[name]
+        assert (origin.run, origin.agent) == (str(recipe_first), name)
+
+
+@pytest.mark.parametrize("engine", ["lockstep", "stacked"])
+def test_critics_learn_what_the_state_is_like_after_a_recipe(recipe_first: Path, engine: str) -> None:
+    """Statistics of what agents see stay, those of the state follow; both engines learn the same."""
+    first = prepare("copper_net", after(recipe_first), **OPTIONS)
+    _learn_first(first, "cpu")
+    found = train("copper_net", after(recipe_first), engine=engine, **OPTIONS)
+    lone = train("copper_net", after(recipe_first), engine="lockstep", **OPTIONS)
+    for name in AGENTS:
+        parts = [observation_statistics(each.learners[name].env) for each in (first, found)]  # type: ignore[arg-type]
+        np.testing.assert_array_equal(parts[0]["observation"].mean, parts[1]["observation"].mean)
+        assert parts[1]["state"].count > 24 > parts[0]["state"].count
+        for key, value in weights(lone.learners[name]).items():
+            torch.testing.assert_close(weights(found.learners[name])[key], value, rtol=1e-5, atol=1e-6)
+
+
+def test_run_after_a_recipe_goes_on_to_the_same_bits(recipe_first: Path, tmp_path: Path) -> None:
+    """From the first moment on, without the recipe's file; critics' statistics go on following."""
+    asked = after(recipe_first)
+    whole = train("copper_net", asked, directory=tmp_path / "whole", engine="lockstep", **OPTIONS)
+    run = RunDirectory(tmp_path / "run")
+    callbacks: dict[str, BaseCallback] = {"use": FailsAtOnce()}
+    with pytest.raises(LearnerError):
+        train("copper_net", asked, directory=run.path, engine="lockstep", callbacks=callbacks, **OPTIONS)
+    recipe_first.unlink()
+    found = resume(run.path)
+    assert all(same(weights(found.learners[name]), weights(whole.learners[name])) for name in AGENTS)
+    assert run.config.origins == whole.config.origins
+    states = [observation_statistics(each.learners["use"].env)["state"] for each in (found, whole)]  # type: ignore[arg-type]
+    np.testing.assert_array_equal(states[0].mean, states[1].mean)
+
+
+def test_a_run_that_kept_nothing_has_its_recipe_learn_again(recipe_first: Path, tmp_path: Path) -> None:
+    """It does not begin without the first guess."""
+    asked, run = after(recipe_first), RunDirectory(tmp_path / "run")
+    whole = train("copper_net", asked, directory=run.path, **OPTIONS)
+    shutil.rmtree(run.path / "checkpoints")
+    nothing_saved(run.path)
+    found = resume(run.path)
+    assert all(same(weights(found.learners[name]), weights(whole.learners[name])) for name in AGENTS)
+
+
+def test_recipes_that_cannot_learn_first_are_named(recipe_first: Path, tmp_path: Path) -> None:
+    """Those that begin with a recipe themselves, those of other policies, and those that see something else."""
+    text, start = recipe_first.read_text(), {"recipe": str(recipe_first)}
+    loop = tmp_path / "loop.toml"
+    loop.write_text(text.replace("[learner]", f"[learner]\nstart = {{ recipe = '{loop}' }}"))
+    with pytest.raises(DefinitionError, match=r"'guess' begins with a recipe itself; name one that begins"):
+        load_recipe(loop)
+    other = Recipe.model_validate(recipe().model_dump() | {"learner": {"algorithm": "A2C", "start": start}})
+    with pytest.raises(RecipeError, match=r"agent 'mine': start: .* has algorithm = 'PPO', not 'A2C'"):
+        train("copper_net", other, directory=tmp_path / "run", **OPTIONS)
+    narrow = PPO | {"policy_kwargs": {"net_arch": [9]}}
+    with pytest.raises(RecipeError, match=r"there and \(9, 4\) here; write policy_kwargs as there"):
+        train("copper_net", after(recipe_first, parameters=narrow), directory=tmp_path / "run", **OPTIONS)
+    assert not (tmp_path / "run").exists()
+    recipe_first.write_text(text.replace("reward = 'team'", "reward = 'team'\nobserve = 'full'"))
+    with pytest.raises(RecipeError, match=r"agent 'mine': start: .*: 'mine' sees other things"):
+        train("copper_net", after(recipe_first), **OPTIONS)
+    assert train("copper_net", after(recipe_first), observe="full", **OPTIONS).joint_steps == 12
+
+
 def test_somebody_has_to_learn(first: tuple[Training, Path]) -> None:
     """If all only act, nothing is left of a training."""
     with pytest.raises(RecipeError, match=r"nobody learns: share_of_steps is 0 for all of \['mine', 'use'\]"):
@@ -332,10 +433,14 @@ start = { run = "runs/first", agent = "mine" }
         (
             "run =",
             "runn =",
-            "learner.start.runn: unknown key 'runn'. Did you mean 'run'? Known: run, agent, last_layer.",
+            "learner.start.runn: unknown key 'runn'. Did you mean 'run'? Known: run, agent, last_layer, recipe, steps.",
         ),
         ('{ run = "runs/first", agent = "mine" }', '"runs/first"', "learner.start: must be a table { run = … }, got"),
         ("share_of_steps = 0", "share_of_steps = -0.1", "share_of_steps: must be at least 0"),
+        ("run =", "steps = 9, run =", "start.steps: are those of a recipe that learns first; a run has its steps"),
+        ('run = "runs/first", ', "", "learner.start: needs either a run or a recipe that learns first"),
+        ('"runs/first"', '"runs/first", recipe = "mappo"', "learner.start: needs either a run or a recipe that learns"),
+        ('run = "runs/first"', 'recipe = "mapo"', "start.recipe: unknown recipe 'mapo'. Did you mean 'mappo'?"),
         ("start =", "# start =", "learner.share_of_steps: 0, so that it never learns: give a start by which it acts"),
     ],
 )

@@ -86,7 +86,8 @@ def _mistake(item: Mapping[str, Any], model: type[BaseModel]) -> str:
         return f"{path}: missing"
     if item["type"] in ("model_type", "model_attributes_type"):
         table = _model_at(model, location)
-        keys = [f.alias or name for name, f in table.model_fields.items() if f.is_required()] if table else []
+        names = {f.alias or name: f.is_required() for name, f in table.model_fields.items()} if table else {}
+        keys = [name for name, is_required in names.items() if is_required] or [*names][:1]
         return f"{path}: must be a table {{ {', '.join(f'{key} = …' for key in keys)} }}, got {item['input']!r}"
     if item["type"] == "string_pattern_mismatch":
         return f"{path}: begins with a letter and has lower-case letters, digits and _ only, got {item['input']!r}"

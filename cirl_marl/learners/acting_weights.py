@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 
 from cirl_marl.errors import RunError
 from cirl_marl.learners import checkpoint
+from cirl_marl.learners.checkpoint import CRITICS
 from cirl_marl.learners.interface import create_run
 from cirl_marl.learners.learner import acting_learner
 from cirl_marl.learners.run_directory import RunConfig, RunDirectory
 from cirl_marl.network import Network
 
-CRITICS = ("value_net.", "mlp_extractor.value_net.", "critic.", "critic_target.", "actor_target.")
-"""Beginnings of the names of parameters by which no policy acts."""
 NORMALISER = "normaliser"
 
 

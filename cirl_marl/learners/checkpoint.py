@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,8 @@ from cirl_marl.records.files import read_json
 
 KIND = "__kind__"
 """Key that says what a table stands for, if it is no table."""
+CRITICS = ("value_net.", "mlp_extractor.value_net.", "critic.", "critic_target.", "actor_target.")
+"""Beginnings of the names of parameters by which no policy acts."""
 UNREADABLE = (
     OSError,
     ValueError,
@@ -265,10 +267,12 @@ class FrozenStatistics(RunningMeanStd):
         """Do nothing."""
 
 
-def freeze_statistics(env: VecNormalize) -> None:
-    """Let the statistics of observations stay as they are."""
-    frozen_by_key = {key: FrozenStatistics(part) for key, part in observation_statistics(env).items()}
-    env.obs_rms = frozen_by_key if isinstance(env.obs_rms, dict) else frozen_by_key["observation"]  # type: ignore[assignment]
+def freeze_statistics(env: VecNormalize, keys: Collection[str], source: VecNormalize | None = None) -> None:
+    """Let these statistics of observations stay as they are, or as ``source`` has them; others go on following."""
+    parts = observation_statistics(source or env)
+    frozen_by_key = {key: FrozenStatistics(part) for key, part in parts.items() if key in keys}
+    by_key = observation_statistics(env) | frozen_by_key
+    env.obs_rms = by_key if isinstance(env.obs_rms, dict) else by_key["observation"]
 
 
 def _moments(moments: RunningMeanStd) -> dict[str, Any]:

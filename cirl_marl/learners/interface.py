@@ -131,6 +131,8 @@ def _train(
         for training in trainings:
             training.check_callbacks(callbacks or {})
             training.stackable(callbacks or {})
+        for training in trainings:
+            _learn_first(training, device)
         for (_, directory), training in zip(runs, trainings, strict=True):
             if directory is not None:
                 run = create_run(Path(directory), training.config, training.env.network)
@@ -138,6 +140,20 @@ def _train(
                 training.keep_in(run)
         run_together(trainings, callbacks=callbacks, report=report, device=device)
     return trainings
+
+
+def _learn_first(training: Training, device: str) -> None:
+    """Train the recipes with which learners begin, in the same network and with the same seed; give them what acts."""
+    env, config = training.env, training.config
+    recipes = {name: (start.recipe, start.steps) for name, start in training.starts.items() if start.recipe}
+    options = {key: config.options[key] for key in ("observe", "horizon", "uncertain") if key in config.options}
+    for recipe, steps in dict.fromkeys(recipes.values()):
+        first = prepare(env.network, recipe, steps=steps, seed=config.seed, agents=env.agents, **options)
+        with tempfile.TemporaryDirectory() as folder:
+            run = create_run(Path(folder) / "run", first.config, first.env.network)
+            first.keep_in(run)
+            run_together([first], device=device)
+            training.begin_from({name: run.path for name, key in recipes.items() if key == (recipe, steps)})
 
 
 def prepare(
@@ -223,6 +239,8 @@ def resume(
         if version_changes := run.other_versions():
             warnings.warn(f"{run.path}: other versions may give other bits: {'; '.join(version_changes)}", stacklevel=2)
         training, checkpoint = _from_newest_checkpoint(run, config, checkpoint_every)
+        if checkpoint is None:
+            _learn_first(training, device)
         training.check_callbacks(callbacks or {})
         run.reopen(config, checkpoint)
         training.keep_in(run)

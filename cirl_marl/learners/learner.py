@@ -172,7 +172,7 @@ class Learner:
         checkpoint.set_model_state(self.model, state["model"])
         if self.normaliser is not None:
             if self.spec.start is not None and self.normaliser.norm_obs:
-                checkpoint.freeze_statistics(self.normaliser)
+                checkpoint.freeze_statistics(self.normaliser, self.spec.start.frozen_statistics)
             checkpoint.set_normaliser_state(self.normaliser, state["normaliser"])
         buffer = getattr(self.model, "replay_buffer", None)
         if buffer is not None and state["buffer"] is not None:

@@ -27,7 +27,7 @@ from cirl_marl.definitions.error_messages import validation_mistakes
 from cirl_marl.definitions.quantities import Number
 from cirl_marl.definitions.reader import read_toml
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import DefinitionError, RecipeError, unknown_name
+from cirl_marl.errors import CirlError, DefinitionError, RecipeError, unknown_name
 from cirl_marl.learners.views import CENTRAL_CRITIC, AllAtOnce, OneAgent, Scheme, SharedPolicy, View
 from cirl_marl.network import Network
 from cirl_marl.network.elements import Moment, Node, Observe, Reward, Role
@@ -101,11 +101,13 @@ class Demonstrations(Settings):
 
 
 class Start(Settings):
-    """What was learnt in another run, with which a learner begins."""
+    """What was learnt before, with which a learner begins: in another run, or by another recipe that comes first."""
 
-    run: Annotated[StrictStr, Field(min_length=1)] = Field(
+    LATER = ("recipe", "steps")
+    run: Annotated[StrictStr, Field(min_length=1)] | None = Field(
+        None,
         description="directory of the run; a relative path counts from the working directory, as that of cirl train; "
-        "{seed} stands for the seed of the training"
+        "{seed} stands for the seed of the training",
     )
     agent: StrictStr | None = Field(None, description="learner of that run; None is the one of the same name")
     last_layer: StrictBool = Field(
@@ -113,6 +115,40 @@ class Start(Settings):
         description="whether only the last layer goes on learning: a search of whole episodes that moves a few hundred "
         "weights instead of thousands. For ARS that can be stacked",
     )
+    recipe: Annotated[StrictStr, Field(min_length=1)] | None = Field(
+        None,
+        description="instead of a run: recipe that learns first, in the same network, with the same seed; what acts is "
+        "taken of it, while critics and exploration begin as this recipe says",
+    )
+    steps: Count | None = Field(None, description="steps of that recipe; None is its own")
+
+    @property
+    def takes_critics(self) -> bool:
+        """Whether critics and exploration are taken over, not only what acts."""
+        return self.recipe is None
+
+    @property
+    def frozen_statistics(self) -> tuple[str, ...]:
+        """Parts of observations whose statistics stay as they were: what critics see is new to critics that are."""
+        return ("observation", "state") if self.takes_critics else ("observation",)
+
+    def mistakes(self, algorithm: str) -> Iterator[str]:
+        """Yield what is wrong with the start of a learner by ``algorithm``, whatever the network."""
+        if self.last_layer and algorithm != "ARS":
+            yield f"start.last_layer: is for ARS, not for {algorithm}"
+        if (self.run is None) == (self.recipe is None):
+            yield "start: needs either a run or a recipe that learns first"
+        if self.recipe is None:
+            if self.steps is not None:
+                yield "start.steps: are those of a recipe that learns first; a run has its steps behind it"
+            return
+        try:
+            first = Recipe.model_validate(read_toml(recipe_path(self.recipe)))
+        except (CirlError, ValidationError) as error:
+            yield f"start.recipe: {error}"
+            return
+        if any(spec.start is not None and spec.start.recipe for spec in (first.learner, *first.match)):
+            yield f"start.recipe: '{first.name}' begins with a recipe itself; name one that begins with none"
 
 
 class LearnerSettings(Settings):
@@ -138,9 +174,7 @@ class LearnerSettings(Settings):
     share_of_steps: Annotated[Number, Field(ge=0, le=1)] = Field(
         1.0, description="share of the run during which the agent learns; after it, it only acts; 0 needs a start"
     )
-    start: Start | None = Field(
-        None, description="policy of another run to begin with, of the same algorithm and for the same spaces"
-    )
+    start: Start | None = Field(None, description="policy to begin with, of the same algorithm and for the same spaces")
     demonstrations: Demonstrations | None = Field(
         None, description="what fills the replay buffer of an off-policy learner, and what others imitate"
     )
@@ -160,8 +194,8 @@ class LearnerSettings(Settings):
         yield from algorithm_mistakes(self.algorithm, self.policy, self.parameters)
         if self.policy == CENTRAL_CRITIC and not self.normalise.observation:
             yield f"normalise.observation: {CENTRAL_CRITIC} sees physical units, so it must be true"
-        if self.start is not None and self.start.last_layer and self.algorithm != "ARS":
-            yield f"start.last_layer: is for ARS, not for {self.algorithm}"
+        if self.start is not None:
+            yield from self.start.mistakes(self.algorithm)
         if self.among == "copies" and self.scheme == "independent":
             yield "among: copies is for the schemes shared and joint; an independent learner has one agent"
         if self.share_of_steps == 0 and self.start is None:

@@ -24,6 +24,7 @@ from cirl_marl.learners.checkpoint import read_tree, write_tree
 from cirl_marl.learners.demonstrations import Demonstrator
 from cirl_marl.learners.learner import Learner, derived_seed, has_tensorboard
 from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, Streams, TrainingStop
+from cirl_marl.learners.recipe import Start
 from cirl_marl.learners.run_directory import RunConfig, RunDirectory, TableFile, steps_of
 from cirl_marl.learners.stacked.conditions import gradient_obstacle, gradient_stacks, obstacle, stacks
 from cirl_marl.learners.stacked.stack import Stack, StackedPolicies
@@ -105,13 +106,12 @@ class Training:
                     self.learners[name] = learner.load(checkpoint)
                 else:
                     self.learners[name] = learner.restore(checkpoint)
-        starts = [(learner, learner.spec.start) for learner in self.learners.values() if learner.spec.start is not None]
         if checkpoint is None:
-            origins = {learner.name: begin_from(learner, start, env, config.seed) for learner, start in starts}
-            self.config = config.model_copy(update={"origins": origins})
+            runs = {name: start.run for name, start in self.starts.items() if start.run is not None}
+            self.begin_from({name: run.replace("{seed}", str(config.seed)) for name, run in runs.items()})
         elif checkpoint.name.endswith("-start"):
-            for learner, _ in starts:
-                begin_again(checkpoint, learner)
+            for name in self.starts:
+                begin_again(checkpoint, self.learners[name])
         self._aims = aims_of(env.network, CIRCULARITY, config.recipe.run.at_most)
         self._multiplier = self._constraint_multipliers()  # its least price is the recipe's, not one that has moved
         if self._saved_state is not None:
@@ -131,6 +131,17 @@ class Training:
         self._shortest_interval = CHECKPOINT_EVERY if checkpoint_every is None else checkpoint_every
         self._checkpoint_interval = self._shortest_interval or None
         self._appoint_demonstrators()
+
+    @property
+    def starts(self) -> dict[str, Start]:
+        """What learners begin with, by name, of those that begin with something."""
+        return {name: learner.spec.start for name, learner in self.learners.items() if learner.spec.start is not None}
+
+    def begin_from(self, runs: Mapping[str, str | Path]) -> None:
+        """Give learners, by name, the policies that ``runs`` learnt; a ``RecipeError`` names what does not fit."""
+        starts = self.starts
+        origins = {name: begin_from(self.learners[name], starts[name], self.env, run) for name, run in runs.items()}
+        self.config = self.config.model_copy(update={"origins": self.config.origins | origins})
 
     def _constraint_multipliers(self) -> Multipliers | None:
         """Return the multipliers of the services and budgets if they move."""

@@ -60,7 +60,8 @@ class StackedInputs:
         self._moments = {key: RunningMeanStd(shape=(len(members), part.shape[2])) for key, part in self._parts.items()}
         self._return_moments = RunningMeanStd(shape=(len(members), 1))
         spec = members[0].spec
-        self._follows = spec.normalise.observation and spec.start is None  # statistics stay as they are after a start
+        frozen = spec.start.frozen_statistics if spec.start is not None else ()
+        self._follows = [key for key in self._parts if spec.normalise.observation and key not in frozen]
         for rows_of_all, moments, of_learner in self._statistics():
             moments.mean[rows_of_all], moments.var[rows_of_all] = of_learner.mean, of_learner.var
             moments.count = of_learner.count
@@ -77,9 +78,9 @@ class StackedInputs:
         """Return the present observations, shape (N, B, entries); ``update_moments`` has them count in the moments."""
         for i, learner in enumerate(self._members):
             _enter(self._parts, i, learner.agent_env.reset())
-        if update_moments and self._follows:
-            for key, part in self._parts.items():
-                _update(self._moments[key], part)
+        if update_moments:
+            for key in self._follows:
+                _update(self._moments[key], self._parts[key])
         return self._normalise()
 
     def final_observations(self, dones: NDArray[np.bool_]) -> Tensor:
