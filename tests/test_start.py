@@ -348,6 +348,19 @@ def test_what_acts_is_that_of_a_recipe_that_learnt_first(recipe_first: Path, tmp
         assert (origin.run, origin.agent) == (str(recipe_first), name)
 
 
+def test_each_learner_has_the_recipe_and_the_steps_that_it_names(recipe_first: Path) -> None:
+    """Learners of the same recipe and steps have what was learnt together."""
+    guess, longer = ({"recipe": str(recipe_first), "steps": steps} for steps in (None, 48))
+    both = prepare("copper_net", recipe(matches=[{"agents": ["mine"], "start": longer}], start=guess), **OPTIONS)
+    lone = [prepare("copper_net", recipe(start=start), **OPTIONS) for start in (guess, longer)]
+    for training in (both, *lone):
+        _learn_first(training, "cpu")
+    usual, late = lone
+    assert same(weights(both.learners["mine"]), weights(late.learners["mine"]))
+    assert same(weights(both.learners["use"]), weights(usual.learners["use"]))
+    assert not same(weights(late.learners["use"]), weights(usual.learners["use"]))
+
+
 @pytest.mark.parametrize("engine", ["lockstep", "stacked"])
 def test_critics_learn_what_the_state_is_like_after_a_recipe(recipe_first: Path, engine: str) -> None:
     """Statistics of what agents see stay, those of the state follow; both engines learn the same."""
@@ -454,3 +467,31 @@ def test_mistakes_in_the_file_are_named(tmp_path: Path, old: str, new: str, mess
         load_recipe(path)
     assert isinstance(raised.value, CirlError) and str(path) in str(raised.value)
     assert message in str(raised.value)
+
+
+def test_what_a_run_begins_with_acts_if_nothing_better_comes(first: tuple[Training, Path], tmp_path: Path) -> None:
+    """It is evaluated before the first step, at prices that stay; whoever begins with nothing is evaluated later."""
+    idle = PPO | {"learning_rate": 0.0}
+    asked = recipe(**from_run(first[1], parameters=idle))
+    settings = {"evaluations": 3, "episodes": 4, "min_service": 0.99, "price_rate": 0.5}
+    asked = asked.model_copy(
+        update={"run": asked.run.model_copy(update=settings), "environment": {"reward": "team", "circularity": "mean"}}
+    )
+    found = train("copper_net", asked, directory=tmp_path / "run", **OPTIONS)
+    run = RunDirectory(tmp_path / "run")
+    assert run.acting_checkpoint.name == "000000000-best"
+    rows = (run.path / "evaluations.csv").read_text().splitlines()[1:]
+    assert [int(row.split(",")[0]) for row in rows] == [0, 4, 8, 12]
+    weights_of_circularity = [row.split(",")[-2] for row in rows]
+    assert weights_of_circularity[0] == weights_of_circularity[1] != weights_of_circularity[2]
+    env = found.env
+    observations = env.reset(seed=[1, 2])
+    before, after_run = Trained(first[1]), Trained(run)
+    for each in (before, after_run):
+        each.start(env, 0)
+    for agent, action in before.act(observations).items():
+        np.testing.assert_array_equal(action, after_run.act(observations)[agent])
+    plain = asked.model_copy(update={"learner": asked.learner.model_copy(update={"start": None})})
+    train("copper_net", plain, directory=tmp_path / "plain", **OPTIONS)
+    rows = (tmp_path / "plain" / "evaluations.csv").read_text().splitlines()[1:]
+    assert [int(row.split(",")[0]) for row in rows] == [4, 8, 12]

@@ -320,10 +320,21 @@ class Training:
         learner.write_state(folder, more, in_stack=learner.name in self._stack_names)
         self._checkpoint_seconds += time.perf_counter() - began
 
+    def evaluate_start(self) -> None:
+        """Keep what the learners begin with as the best so far, if they begin with something; no price moves."""
+        if self.starts and self.joint_steps == 0 and self._best is None:
+            self._validate()
+
     def _evaluate(self) -> None:
-        """Validate the policies of now, keep them if they are the best so far, and move the multiplier."""
+        """Validate the policies of now, and move the multiplier."""
+        score = self._validate()
+        if score is not None and self._multiplier is not None:
+            self._multiplier.update([*score.levels.values()], score.accounts)
+
+    def _validate(self) -> Score | None:
+        """Validate the policies of now, and keep them if they are the best so far; None if the run has none chosen."""
         if self._validation_env is None:
-            return
+            return None
         self._bring_up_to_date()
         policies = StackedPolicies(self.learners, self._stacks)
         score = validation_score(self._validation_env, policies, self._aims)
@@ -338,8 +349,7 @@ class Training:
             steps = (self.joint_steps, self.joint_steps * self.config.envs)
             row = (score.circularity, score.service, score.service_bound, score.episode_return)
             self._evaluations.append([*steps, *row, self.env.circularity_weight, better])
-        if self._multiplier is not None:
-            self._multiplier.update([*score.levels.values()], score.accounts)
+        return score
 
     def _write_policies(self, folder: Path) -> None:
         for learner in self.learners.values():
@@ -398,6 +408,8 @@ def run_together(
     reports: list[TrainingReport | None] = [report] + [None] * (len(trainings) - 1)
     try:
         with one_torch_thread(), _interruption() as stop_requested:
+            for training in trainings:
+                training.evaluate_start()
             hooks = [partial(t.after_step, began, observer) for t, observer in zip(trainings, reports, strict=True)]
             participants = list(_participants(trainings, stacks_of_learners, callbacks))
             lockstep = Lockstep([t.world for t in trainings], participants)
