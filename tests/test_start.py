@@ -376,6 +376,17 @@ def test_critics_learn_what_the_state_is_like_after_a_recipe(recipe_first: Path,
             torch.testing.assert_close(weights(found.learners[name])[key], value, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("engine", ["lockstep", "stacked"])
+def test_critics_of_a_run_keep_what_they_know_of_the_state(tmp_path: Path, engine: str) -> None:
+    """They come with the policy, and so do the statistics by which they see."""
+    central = {"policy": "CentralCriticPolicy"}
+    source = train("copper_net", recipe(**central), directory=tmp_path / "first", **OPTIONS)
+    found = train("copper_net", recipe(**central, **from_run(tmp_path / "first")), engine=engine, **OPTIONS)
+    for name in AGENTS:
+        before, now = (observation_statistics(each.learners[name].env)["state"] for each in (source, found))  # type: ignore[arg-type]
+        np.testing.assert_array_equal([before.mean, before.var], [now.mean, now.var])
+
+
 def test_run_after_a_recipe_goes_on_to_the_same_bits(recipe_first: Path, tmp_path: Path) -> None:
     """From the first moment on, without the recipe's file; critics' statistics go on following."""
     asked = after(recipe_first)
