@@ -221,6 +221,7 @@ class Dynamics(FlowLaws):
         except ArithmeticError as error:
             raise CirlError(f"network '{self.network.name}': {error}") from error
         return rate, through, done[0]
+
     def _move_slots(self, stock: Floats, rate: Floats) -> Floats:
         """Return the masses once slots have moved on, and set the rates of what comes out of them, in place."""
         if self.slots is None:
