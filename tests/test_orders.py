@@ -206,6 +206,7 @@ def test_what_passes_markets_is_what_steps_from_nothing_come_to(seed: int) -> No
     dynamics = MultiAgentVectorEnv(network, num_envs=1).dynamics
     orders, staged, rng = dynamics.orders, dynamics.staged_network, np.random.default_rng(seed)
     rate = dynamics.rate(dynamics.neutral[:, :1], np.zeros(1, dtype=np.intp))
+    rate[orders.arcs] *= rng.integers(0, 2, (len(orders.arcs), 1)) if seed % 2 else 1.0  # some order nothing
     flow = np.zeros_like(rate)
     flow[orders.inflows] = rng.uniform(0, 20, (len(orders.inflows), 1)) * rng.integers(0, 2)
     through, _ = orders.clear(rate, flow)

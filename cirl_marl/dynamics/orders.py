@@ -39,15 +39,15 @@ BLOCKS, PIVOTS = 20, 20
 
 
 @positional_record
-class Clearing:
+class Regime:
     """Which markets have enough for all that is ordered."""
 
     has_enough: Annotated[Bools, "whether each does, shape (markets, B)"]
     routes: Annotated[IntervalRoutes, "past those that do the rest goes on, past others what is ordered"]
 
-    def of_copies(self, copies: Integers) -> Clearing:
+    def of_copies(self, copies: Integers) -> Regime:
         """Return that of some copies."""
-        return Clearing(self.has_enough[:, copies], self.routes.of_copies(copies))
+        return Regime(self.has_enough[:, copies], self.routes.of_copies(copies))
 
 
 class Orders:
@@ -114,11 +114,11 @@ class Orders:
         Raises:
             ArithmeticError: if that comes to no end; names the node.
         """
-        through, clearing = self.clear(rate, flow)
+        through, regime = self.clear(rate, flow)
         result, accelerate, copies = self.shares(rate, through), Acceleration(), np.arange(rate.shape[1])
         for _ in range(ROUNDS):
             rates, now = rate.take(copies, axis=1), through.take(copies, axis=1)
-            ahead, clearing = self.clear(rates, simulate(copies, result.take(copies, axis=1)), clearing)
+            ahead, regime = self.clear(rates, simulate(copies, result.take(copies, axis=1)), regime)
             far = np.abs(ahead - now) > CLOSE * ahead + ROUNDING * ahead.max(axis=0)
             is_far = far.any(axis=0)
             if not is_far.any():
@@ -128,35 +128,36 @@ class Orders:
             now, copies = np.maximum(accelerate(points, steps), 0.0).T[:, is_far], copies[is_far]
             if not is_far.all():
                 accelerate.select(is_far)
-                clearing = clearing.of_copies(np.flatnonzero(is_far))
+                regime = regime.of_copies(np.flatnonzero(is_far))
             through[:, copies], result[:, copies] = now, self.shares(rates[:, is_far], now)
         name = self._names[int(far.any(axis=1).argmax())]
         raise ArithmeticError(f"orders from node '{name}' are not settled after {ROUNDS} simulations of an interval")
 
-    def clear(self, rate: Floats, inflow: Floats, clearing: Clearing | None = None) -> tuple[Floats, Clearing]:
+    def clear(self, rate: Floats, inflow: Floats, regime: Regime | None = None) -> tuple[Floats, Regime]:
         """Return q of the markets, shape (markets, B), by block principal pivots, then by single ones (Murty 1974).
 
         Args:
             rate: of all arcs, of orders what is ordered, shape (arcs, B).
             inflow: mean flows of the arcs, of which ``inflows`` count, likewise.
-            clearing: where to begin from; None: all have enough.
+            regime: where to begin from; None: all have enough.
 
         Raises:
             ArithmeticError: if pivots come to no end; names the node.
         """
         total, entry_flow = self._sum(rate.take(self.arcs, 0)), np.zeros_like(rate)
         entry_flow[self.inflows] = inflow[self.inflows]
-        clearing = clearing or self._clearing(rate, np.ones(total.shape, dtype=bool))
+        regime = regime or self._regime(rate, np.ones(total.shape, dtype=bool))
         for pivot in range(BLOCKS + PIVOTS * len(self.markets)):
-            has_enough = clearing.has_enough
-            result = self._throughputs(rate, total, entry_flow, clearing)
+            has_enough = regime.has_enough
+            result = self._throughputs(rate, total, entry_flow, regime)
             lack = (total - result) * np.where(has_enough, 1.0, -1.0)
-            is_wrong = lack > ROUNDING * (10.0 * total + np.abs(result).max(axis=0))
+            # where nothing is ordered there is enough, whatever others still lack
+            is_wrong = (lack > ROUNDING * (10.0 * total + np.abs(result).max(axis=0))) & (total > 0)
             if not is_wrong.any():
-                return np.maximum(result, 0.0), clearing
+                return np.maximum(result, 0.0), regime
             if pivot >= BLOCKS:
                 is_wrong &= np.cumsum(is_wrong, axis=0) == 1
-            clearing = self._clearing(rate, has_enough ^ is_wrong)
+            regime = self._regime(rate, has_enough ^ is_wrong)
         raise ArithmeticError(f"orders from node '{self._names[int(is_wrong.any(axis=1).argmax())]}' are not cleared")
 
     def pull_back(self, rate: Floats, through: Floats, adjoint: Floats) -> tuple[Floats, Floats]:
@@ -178,7 +179,7 @@ class Orders:
         """Return what mass moved along arcs is worth, shape (arcs, B), if what passes markets is worth so much."""
         return self._outflows.transpose()(worth)
 
-    def _clearing(self, rate: Floats, has_enough: Bools) -> Clearing:
+    def _regime(self, rate: Floats, has_enough: Bools) -> Regime:
         """Return what markets pass on if those that have enough serve all that is ordered and others have no rest."""
         demand, shares = rate.take(self.arcs, 0), rate.copy()
         part = np.where(has_enough, 0.0, _inverse(self._sum(demand)))
@@ -186,15 +187,15 @@ class Orders:
         shares[self.rest_arcs] *= has_enough.take(self._of_rest, 0)
         routes = self._routing.routes(shares)
         assert routes is not None
-        return Clearing(has_enough, routes)
+        return Regime(has_enough, routes)
 
-    def _throughputs(self, rate: Floats, total: Floats, entry_flow: Floats, clearing: Clearing) -> Floats:
+    def _throughputs(self, rate: Floats, total: Floats, entry_flow: Floats, regime: Regime) -> Floats:
         """Return q that follows from what enters; of markets that have enough it may be less than is ordered."""
-        flow, delivery = entry_flow.copy(), np.where(clearing.has_enough, total, 0.0)
-        flow[self.arcs] = np.where(clearing.has_enough.take(self._of, 0), rate.take(self.arcs, 0), 0.0)
+        flow, delivery = entry_flow.copy(), np.where(regime.has_enough, total, 0.0)
+        flow[self.arcs] = np.where(regime.has_enough.take(self._of, 0), rate.take(self.arcs, 0), 0.0)
         through = self._entries(flow)
         through[self._places] -= delivery
-        return np.asarray(self._routing.throughputs(through, clearing.routes)[self._rows] + delivery)
+        return np.asarray(self._routing.throughputs(through, regime.routes)[self._rows] + delivery)
 
 
 def _inverse(values: Floats) -> Floats:

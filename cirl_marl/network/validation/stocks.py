@@ -61,7 +61,7 @@ def storage_problems(network: Specification, node: Node, outflows: Sequence[Arc]
     orders = [arc.id for arc in outflows if arc.law in ORDER_LAWS]
     for arc in outflows:
         if arc.law is not Law.SHARE and arc.id not in orders:
-            reason = f"its donor '{node.id}' stores nothing, so that only law 'share' can leave it"
+            reason = f"its donor '{node.id}' stores nothing, so that only shares and orders leave it"
             yield f"arc '{arc.id}': law '{arc.law}': {reason}"
     if orders:
         yield from _order_problems(network, subject, orders, outflows)
