@@ -31,6 +31,7 @@ from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.lint import lint_warnings
 from cirl_marl.controllers.lqr import LQR
 from cirl_marl.controllers.rollout import rollout
+from cirl_marl.dynamics.krylov import Acceleration
 from cirl_marl.environments.state import State
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Network
@@ -222,6 +223,46 @@ def test_what_passes_markets_is_what_steps_from_nothing_come_to(seed: int) -> No
             break
     passed = np.bincount(staged.recipients, flow[:, 0], len(staged.nodes))[orders.markets]
     np.testing.assert_allclose(through[:, 0], passed, rtol=1e-10, atol=1e-10)
+    # where just as much is ordered as there is, both what has enough and what has not is right
+    total = np.bincount(staged.donors[orders.arcs], rate[orders.arcs, 0], len(staged.nodes))
+    part = np.divide(through[:, 0], total[orders.markets], out=np.ones(len(through)), where=total[orders.markets] > 0)
+    part = np.minimum(part, 1.0)[np.searchsorted(orders.markets, staged.donors[orders.arcs])]
+    rate[orders.arcs] *= part[:, None]
+    np.testing.assert_allclose(orders.clear(rate, flow)[0], through, rtol=1e-10, atol=1e-10)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr("cirl_marl.dynamics.orders.BLOCKS", 0)
+        np.testing.assert_allclose(orders.clear(rate, flow)[0], through, rtol=1e-10, atol=1e-10)
+
+
+def test_fixed_points_are_found_in_as_many_steps_as_there_are_unknowns() -> None:
+    """Of linear maps, however slowly these lead there; rows go each their own way, and one may be left alone."""
+    rng, size = np.random.default_rng(0), 4
+    matrix, constant = np.diag([0.99, 0.9, 0.6, 0.2]), rng.normal(size=(2, size))
+    exact = np.linalg.solve(np.eye(size) - matrix, constant.T).T
+    accelerate, point = Acceleration(), np.zeros((2, size))
+    for _ in range(size + 1):
+        point = accelerate(point, point @ matrix.T + constant - point)
+    accelerate.select(np.array([False, True]))
+    point = accelerate(point[1:], (point @ matrix.T + constant - point)[1:])
+    np.testing.assert_allclose(point, exact[1:], rtol=1e-8)
+
+
+@pytest.mark.parametrize("prices", [(1.0, -1.0, 0.5), (-1.0, 1.0, 0.5), (0.5, 0.5, -1.0), (-1.0, -1.0, 1.0)])
+@pytest.mark.parametrize("inflow", [6.0, 12.0])
+def test_nobody_can_give_one_customer_more_than_the_rule(inflow: float, prices: tuple[float, ...]) -> None:
+    """What passes the market is next to fixed, and so is what the bound makes of it, whatever it costs."""
+    network = shop(inflow, 3.0, 6.0, accounts=(Account(id="cost", unit="GJ"),))
+    mine = Control(kind=ControlKind.FLOW, low=inflow, neutral=inflow, high=inflow + 1e-6)
+    costs = dict(zip(("order_0", "order_1", "rest"), prices, strict=True))
+    arcs = [
+        replace(arc, law=Law.CONTROLLED, flow=0.0, control=mine)
+        if arc.id == "mine"
+        else replace(arc, accounts={"cost": costs[arc.id]})
+        for arc in network.arcs
+    ]
+    network = replace(network, arcs=tuple(arcs))
+    run = rollout(MultiAgentVectorEnv(network, num_envs=1), Neutral())
+    np.testing.assert_allclose(bound(network, aim="cost").objective, -run.accounts[0, 0], atol=1e-4)
 
 
 @pytest.mark.parametrize("seed", [9, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 6))])

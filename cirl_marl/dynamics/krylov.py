@@ -17,8 +17,6 @@ ACCURACY, LEAST = 1e-11, 1e-290
 """Part of a residual that may be left, and what is taken for 0."""
 DEPTH, DEPENDENT = 12, 1e-9
 """Most directions that accelerate a fixed point, and the part of one that must be new."""
-FALL = 0.5
-"""Part to which a residual has to fall, lest earlier directions are forgotten: the map has a kink between."""
 
 
 def conjugate_residuals(
@@ -80,7 +78,8 @@ class Acceleration:
                 change, move = change - overlap * image, move - overlap * effect
             size = _length(change)
             inverse = np.divide(1.0, size, out=np.zeros_like(size), where=size > DEPENDENT * before + LEAST)
-            falls = _length(residual) < FALL * _length(self._residual)
+            # where a residual grows the map has a kink between, and earlier directions are forgotten
+            falls = _length(residual) < _length(self._residual)
             pairs = [*self._basis[1 - DEPTH :], (change * inverse, move * inverse)]
             self._basis = [(np.where(falls, image, 0.0), np.where(falls, effect, 0.0)) for image, effect in pairs]
         self._point, self._residual = point, residual

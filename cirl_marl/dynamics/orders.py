@@ -32,8 +32,9 @@ from cirl_marl.network import Floats, Integers, Network, RowSum
 from cirl_marl.network.compartment_model import Bools
 from cirl_marl.network.declarations import positional_record
 
-ROUNDS, CLOSE, ROUNDING = 100, 1e-12, 1e-15
-"""Most intervals that are simulated; how near q must be to what it leads to, relative to it, and to the largest q."""
+ROUNDS, CLOSE, ROUNDING = 100, 1e-12, 1e-14
+"""Most intervals that are simulated; how near q must be to what it leads to, relative to it, and to the largest q,
+within which it is also as much as is ordered."""
 BLOCKS, PIVOTS = 20, 20
 """Changes of which nodes have enough, all at once, then one by one: most of them, the latter for each node."""
 
@@ -152,7 +153,7 @@ class Orders:
             result = self._throughputs(rate, total, entry_flow, regime)
             lack = (total - result) * np.where(has_enough, 1.0, -1.0)
             # where nothing is ordered there is enough, whatever others still lack
-            is_wrong = (lack > ROUNDING * (10.0 * total + np.abs(result).max(axis=0))) & (total > 0)
+            is_wrong = (lack > ROUNDING * (total + np.abs(result).max(axis=0))) & (total > 0)
             if not is_wrong.any():
                 return np.maximum(result, 0.0), regime
             if pivot >= BLOCKS:
