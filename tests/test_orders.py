@@ -360,6 +360,33 @@ def test_what_does_not_go_with_orders_is_refused(changed: dict[str, Any], messag
         shop(6.0, 3.0, 6.0, **changed)
 
 
+@pytest.mark.parametrize(
+    ("changed", "fields", "message"),
+    [
+        ("rest", {"control": Control(kind=ControlKind.SHARE, low=0.0, neutral=0.5, high=1.0)}, "serves arcs 'order_0'"),
+        ("order_0", {"capacity_node": "u1", "capacity_rate": 1.0}, "capacity_node: it orders from 'market'"),
+        ("order_0", {"makes_up_for": "need"}, "makes_up_for: it orders from 'market'"),
+        ("mine", {"makes_up_for": "need"}, "makes_up_for 'need'"),
+    ],
+)
+def test_what_no_arc_beside_orders_can_do_is_refused(changed: str, fields: dict[str, Any], message: str) -> None:
+    """Nor is what is ordered more for a supply that enters before it."""
+    network = shop(6.0, 3.0, 6.0, services=(Service(id="need", provider="u0", quantity="stock", low=9.0),))
+    if "makes_up_for" in fields:
+        control = Control(kind=ControlKind.FLOW, low=0.0, neutral=1.0, high=8.0)
+        fields = {**fields, "law": Law.CONTROLLED, "flow": 0.0, "control": control}
+    arcs = tuple(replace(arc, **fields) if arc.id == changed else arc for arc in network.arcs)
+    with pytest.raises(NetworkError, match=message):
+        replace(network, arcs=arcs)
+
+
+def test_flows_at_the_start_follow_the_rule() -> None:
+    """As agents see them before they act."""
+    env = MultiAgentVectorEnv(shop(6.0, 3.0, 6.0), num_envs=2)
+    env.reset(seed=0)
+    np.testing.assert_allclose(env.physical.flow, np.repeat([[6.0], [2.0], [4.0], [0.0]], 2, axis=1), rtol=1e-13)
+
+
 def test_lqr_refuses_what_may_be_cut() -> None:
     """The rule is not linear."""
     with pytest.raises(CirlError, match="orders from nodes that store nothing, 'order_0' for one, may be cut"):

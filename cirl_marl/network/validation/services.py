@@ -145,5 +145,5 @@ def _reach_problems(stockless_exits: Mapping[str, Sequence[Arc]], arc: Arc, serv
         nodes |= new
         queue += new
     if not is_reached:
-        between = "only nodes that store nothing may lie between them"
+        between = "only shares of nodes that store nothing may lie between"
         yield f"{subject}: what it carries does not reach '{service.provider}' at once; {between}"
