@@ -290,21 +290,20 @@ class Network(Specification):
         environment; −1 if it leaves the environment or returns to a reservoir; 0 otherwise or if both hold. What goes
         from one compartment of the environment to another neither enters nor leaves it.
         """
-        signs = []
-        for arc in self.arcs:
-            donor, recipient = self._role(arc.donor), self._role(arc.recipient)
-            within = donor is recipient is Role.ENVIRONMENT
-            enters = recipient in SINKS and not within and (recipient is not Role.ENVIRONMENT or arc.pollutant)
-            loses = donor is Role.NONRENEWABLE_RESERVOIR or enters
-            regains = (donor is Role.ENVIRONMENT and not within) or recipient is Role.NONRENEWABLE_RESERVOIR
-            signs.append(float(loses) - float(regains))
-        return _read_only(np.array(signs))
+        environment, reservoirs = self._of_role(Role.ENVIRONMENT), self._of_role(Role.NONRENEWABLE_RESERVOIR)
+        sinks, (donors, recipients) = self._of_role(*SINKS), (self.donors, self.recipients)
+        within = environment[donors] & environment[recipients]
+        pollutes = np.array([arc.pollutant for arc in self.arcs], dtype=bool)
+        enters = sinks[recipients] & ~within & (pollutes | ~environment[recipients])
+        loses = reservoirs[donors] | enters
+        regains = (environment[donors] & ~within) | reservoirs[recipients]
+        return _read_only(loses.astype(float) - regains)
 
     @cached_property
     def environmental(self) -> NDArray[np.bool_]:
         """Arcs that touch the environment, whose net flow is φ_nz, shape (arcs,)."""
-        through = [Role.ENVIRONMENT in (self._role(a.donor), self._role(a.recipient)) for a in self.arcs]
-        return _read_only(np.array(through, dtype=bool))
+        environment = self._of_role(Role.ENVIRONMENT)
+        return _read_only(environment[self.donors] | environment[self.recipients])
 
     @cached_property
     def graph(self) -> networkx.DiGraph:
@@ -397,6 +396,10 @@ class Network(Specification):
             nodes = [self.node_index[id_] for id_ in service.providers]
             return np.flatnonzero(np.isin(self.donors, nodes))
         return np.array([self.arc_index[id_] for id_ in service.providers])
+
+    def _of_role(self, *roles: Role) -> NDArray[np.bool_]:
+        """Return which nodes have one of these roles, shape (nodes,)."""
+        return np.array([self._role(node.id) in roles for node in self.nodes], dtype=bool)
 
     def _role(self, node: str) -> Role:
         return self.nodes[self.node_index[node]].role
