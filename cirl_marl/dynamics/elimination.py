@@ -10,9 +10,9 @@ shares are a full matrix, and its visits are found at once, by blocks.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import chain
 from typing import Annotated
 
@@ -281,15 +281,16 @@ class EliminatedShares:
     @cached_property
     def _numbers(self) -> Floats:
         """The numbers of ``triangle``."""
-        nodes, (givers, _), _ = self._order.factors
-        out, into = np.split(self.factors, [len(givers)])
-        return self._order.triangle.arrange(np.concatenate([out, self._inverse[nodes], into]))
+        return self._order.triangle.arrange(self._between_sides(self._inverse[self._order.factors[0]]))
 
     @property
     def factors(self) -> Floats:
         """What nodes give on to those eliminated later, then what they get from them, shape (entries, B)."""
-        sides = [[step[side] for step in self._steps] for side in (1, 2)]
-        return np.concatenate([self._inverse[:0], *sides[0], *sides[1]])
+        return self._between_sides(self._inverse[:0])
+
+    def _between_sides(self, middle: Floats) -> Floats:
+        """Return what nodes give on, ``middle``, and what they get, below each other."""
+        return np.concatenate([*(out for _, out, _ in self._steps), middle, *(into for _, _, into in self._steps)])
 
     def pass_pivots(self, values: Floats, nodes: Integers) -> Floats:
         """Return what passes some ``nodes``, the core last, of what comes to each, shape (B, columns, nodes)."""
@@ -307,6 +308,9 @@ class EliminatedShares:
         if len(self._order.core):
             part._visits = self._visits[copies]
         return part
+
+    def _pass_core_rows(self, rows: Floats) -> None:
+        rows[...] = self._pass_core(rows)
 
     def _pass_core(self, core_inflow: Floats) -> Floats:
         """Return what passes through the core for what enters it, shape (nodes of the core, B·n)."""
@@ -329,18 +333,23 @@ class EliminatedShares:
 
         The first half, shape (nodes, B·n), is what enters nodes from elsewhere, in that order; it is used up.
         """
+        for pass_on in self.passes(values):
+            pass_on()
+
+    def passes(self, values: Floats) -> list[Callable[[], object]]:
+        """Return what ``pass_through`` calls, one after the other, for as often as it is to be done."""
         # forward substitution in the order of elimination, then backward: (I − Pᵀ)⁻¹ = L⁻¹ D⁻¹ U⁻¹
         nodes, batch, core = self._order.nodes, self._inverse.shape[1], len(self._order.core)
         if not kernels_round_products():
-            self._pass_rounds(values)
-        elif core:
-            triangle, numbers = self._order.triangle, self._numbers
-            triangle.substitute(numbers, values, batch, last=nodes)
-            values[nodes - core : nodes] = self._pass_core(values[nodes - core : nodes])
-            triangle.substitute(numbers, values, batch, first=nodes)
-        else:
-            # in one call; a round takes longer to call than to compute
-            self._order.triangle.substitute(self._numbers, values, batch)
+            return [partial(self._pass_rounds, values)]
+        triangle = partial(self._order.triangle.substitution, self._numbers, values, batch)
+        if not core:
+            return [triangle()]  # in one call; a round takes longer to call than to compute
+        return [
+            triangle(last=nodes),
+            partial(self._pass_core_rows, values[nodes - core : nodes]),
+            triangle(first=nodes),
+        ]
 
     def _pass_rounds(self, values: Floats) -> None:
         """Do what ``pass_through`` does, round by round."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -57,17 +57,26 @@ class StoreChains:
         self._heads: Integers = np.array(heads, dtype=np.intp)
         self._head_flows: Integers = np.searchsorted(rows, self._heads)
 
-    def set_changes(self, masses: Floats, rates: Floats, flow: Floats, change: Floats) -> None:
-        """Write the flows of the stores, and what the stores change by, into arrays of shapes (flows, B), (masses, B).
+    def changes(self, masses: Floats, rates: Floats, change: Floats) -> Callable[[], None]:
+        """Return what writes what the stores change by, as often as it is called.
 
         Args:
             masses: of all stores, shape (masses, B).
             rates: r of ``flows``, shape (flows, B).
-            flow: for the flows.
-            change: for ẋ; rows of other stores stay as they are.
+            change: for ẋ, shape (masses, B); rows of other stores stay as they are.
         """
-        for run, part in zip(self.runs, self._parts, strict=True):
-            np.multiply(masses[run], rates[part], out=flow[part])
-            np.subtract(flow[part][:-1], flow[part][1:], out=change[run][1:])
-        if self.runs:
-            change[self._heads] = 0.0 - flow.take(self._head_flows, 0)
+        flow, heads = np.empty_like(rates), np.empty((len(self._heads), rates.shape[1]))
+        runs = [
+            (masses[run], rates[part], flow[part], flow[part][:-1], flow[part][1:], change[run][1:])
+            for run, part in zip(self.runs, self._parts, strict=True)
+        ]
+
+        def write() -> None:
+            for stock, rate, moved, before, after, difference in runs:
+                np.multiply(stock, rate, moved)
+                np.subtract(before, after, difference)
+            if runs:
+                flow.take(self._head_flows, 0, heads, "clip")  # "raise" would copy
+                change[self._heads] = np.subtract(0.0, heads, heads)
+
+        return write

@@ -203,26 +203,31 @@ class KronReduction:
             factors: …, b, a, from the innermost.
             rate: shape (arcs, B).
         """
-        rates, chain_rates = rate.take(self._varying_flows, 0), rate.take(self._chain_flows, 0)
-        shares, chain_flow = routes.rate.take(self._varying_arcs, 0), np.empty_like(chain_rates)
+        rates, shares = rate.take(self._varying_flows, 0), routes.rate.take(self._varying_arcs, 0)
         work: Floats = np.empty((self._change.stop, stock.shape[1]))
         mean: Floats = work[self._masses]
         flows, passing, sent_rows = work[self._flows], work[self._passing], work[self._sent_rows]
         varying_rows, change, sums = work[self._varying_rows], work[self._change], [work[rows] for rows in self._sums]
+        # what is called in each term is looked up once, as a call of few copies takes longer than what it does
+        take, send, multiply = mean.take, passing.take, np.multiply
+        along_chains = self._chains.changes(mean, rate.take(self._chain_flows, 0), change)
+        enter, spread = (matrix.kernel(stock.shape[1]) for matrix in (self._inflow_matrix, self._spread))
+        passes = routes.kept_nodes.passes(passing)
         mean[...] = stock
         for factor in factors:
-            mean.take(self._drivers, 0, out=flows, mode="clip")  # "raise" would copy
-            flows *= rates
+            take(self._drivers, 0, flows, "clip")  # "raise" would copy
+            multiply(flows, rates, flows)
             for rows in sums:
                 rows.fill(0.0)
-            self._chains.set_changes(mean, chain_rates, chain_flow, change)
-            self._inflow_matrix.substitute(work)
-            routes.kept_nodes.pass_through(passing)
-            passing.take(self._senders, 0, out=sent_rows, mode="clip")
-            varying_rows *= shares
-            self._spread.substitute(work)
-            change *= factor
-            np.add(stock, change, out=mean)
+            along_chains()
+            enter(work, work)
+            for pass_on in passes:
+                pass_on()
+            send(self._senders, 0, sent_rows, "clip")
+            multiply(varying_rows, shares, varying_rows)
+            spread(work, work)
+            multiply(change, factor, change)
+            np.add(stock, change, mean)
         return mean
 
 

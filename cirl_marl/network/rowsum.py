@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from copy import copy
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 
 import numpy as np
@@ -71,14 +71,18 @@ class Triangle:
             first: the first row that is replaced; those before it hold what they should already.
             last: the row after the last one.
         """
+        self.substitution(numbers, values, batch, first, last)()
+
+    def substitution(
+        self, numbers: Floats, values: Floats, batch: int, first: int = 0, last: int | None = None
+    ) -> Callable[[], object]:
+        """Return what does as ``substitute``, as often as it is called."""
         starts, columns, _ = self._block(batch)
         rows = slice(first * batch, (len(self._counts) if last is None else last) * batch)
         starts, flat, each = starts[rows.start : rows.stop + 1], values.reshape(-1), values.shape[1] // batch
         result, size = flat[rows.start * each : rows.stop * each], len(self._counts) * batch
-        if each == 1:
-            csr_matvec(rows.stop - rows.start, size, starts, columns, numbers, flat, result)
-        else:
-            csr_matvecs(rows.stop - rows.start, size, each, starts, columns, numbers, flat, result)
+        kernel, counts = (csr_matvec, ()) if each == 1 else (csr_matvecs, (each,))
+        return partial(kernel, rows.stop - rows.start, size, *counts, starts, columns, numbers, flat, result)
 
     def _block(self, batch: int) -> tuple[Integers, Integers, Integers]:
         """Return where each row of each copy begins, the columns of its entries, and where their numbers are."""
@@ -118,6 +122,15 @@ class RowSum:
         self.shape, self._starts, self._rows = shape, matrix.indptr, matrix.indices
         self._weights: Floats = matrix.data
         self._transposes: dict[bool, RowSum] = {}
+        self._kernels: dict[int, Callable[[Floats, Floats], object]] = {}
+
+    def kernel(self, batch: int) -> Callable[[Floats, Floats], object]:
+        """Return what adds W x to y in place, ``kernel(x, y)``, for C-contiguous arrays of so many columns."""
+        if batch not in self._kernels:
+            entries = self._starts, self._rows, self._weights
+            kernel, columns = (csc_matvec, ()) if batch == 1 else (csc_matvecs, (batch,))
+            self._kernels[batch] = partial(kernel, *self.shape, *columns, *entries)
+        return self._kernels[batch]
 
     def __call__(self, values: Floats) -> Floats:
         """Return W x for x of shape (columns, B)."""
@@ -125,11 +138,7 @@ class RowSum:
 
     def add_to(self, result: Floats, values: Floats) -> Floats:
         """Add W x to ``result``, shape (rows, B), in place, and return it; both arrays are C-contiguous."""
-        batch, entries = values.shape[1], (self._starts, self._rows, self._weights)
-        if batch == 1:
-            csc_matvec(*self.shape, *entries, values, result)
-        else:
-            csc_matvecs(*self.shape, batch, *entries, values, result)
+        self.kernel(values.shape[1])(values, result)
         return result
 
     def substitute(self, values: Floats) -> Floats:
@@ -143,7 +152,7 @@ class RowSum:
     def scaled_by(self, factor: float) -> RowSum:
         """Return factor·W."""
         matrix = copy(self)
-        matrix._weights, matrix._transposes = self._weights * factor, {}
+        matrix._weights, matrix._transposes, matrix._kernels = self._weights * factor, {}, {}
         return matrix
 
     def transpose(self, *, reverse: bool = False) -> RowSum:
