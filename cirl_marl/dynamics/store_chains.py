@@ -54,8 +54,7 @@ class StoreChains:
         pieces = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else []
         self.runs = [slice(int(piece[0]), int(piece[-1]) + 1) for piece in pieces]
         self._parts = spans(map(len, pieces))
-        self._heads: Integers = np.array(heads, dtype=np.intp)
-        self._head_flows: Integers = np.searchsorted(rows, self._heads)
+        self._heads, self._head_flows = _spaced(np.array(heads, dtype=np.intp)), _spaced(np.searchsorted(rows, heads))
 
     def changes(self, masses: Floats, rates: Floats, change: Floats) -> Callable[[], None]:
         """Return what writes what the stores change by, as often as it is called.
@@ -65,7 +64,7 @@ class StoreChains:
             rates: r of ``flows``, shape (flows, B).
             change: for ẋ, shape (masses, B); rows of other stores stay as they are.
         """
-        flow, heads = np.empty_like(rates), np.empty((len(self._heads), rates.shape[1]))
+        flow = np.empty_like(rates)
         runs = [
             (masses[run], rates[part], flow[part], flow[part][:-1], flow[part][1:], change[run][1:])
             for run, part in zip(self.runs, self._parts, strict=True)
@@ -76,7 +75,12 @@ class StoreChains:
                 np.multiply(stock, rate, moved)
                 np.subtract(before, after, difference)
             if runs:
-                flow.take(self._head_flows, 0, heads, "clip")  # "raise" would copy
-                change[self._heads] = np.subtract(0.0, heads, heads)
+                change[self._heads] = 0.0 - flow[self._head_flows]
 
         return write
+
+
+def _spaced(places: Integers) -> Integers | slice:
+    """Return places as a slice, which is looked up sooner, if they are evenly spaced."""
+    steps = set(np.diff(places).tolist())
+    return slice(int(places[0]), int(places[-1]) + 1, steps.pop()) if len(steps) == 1 else places

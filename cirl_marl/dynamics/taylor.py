@@ -184,9 +184,10 @@ class KronReduction:
         self._passing = slice(kept_inflows.start, passed.stop)
         self._sent_rows = slice(kept_rows.start, self._varying_rows.stop)
         size, first = self._change.stop, self._change.start
+        # nothing enters batch rows and the unit row, which stand after the stores
         starts = [hubs.start, *(first + run.stop for run in self._chains.runs)]
-        stops = [*(first + run.start for run in self._chains.runs), size]
-        self._sums = [slice(start, stop) for start, stop in zip(starts, stops, strict=True)]
+        stops = [*(first + run.start for run in self._chains.runs), first + laws.rows.nodes.stop]
+        self._sums = [slice(start, stop) for start, stop in zip(starts, stops, strict=True) if start < stop]
         rows = [
             dict(zip(columns, range(part.start, part.stop), strict=True))
             for columns, part in zip(names, parts, strict=True)
@@ -204,7 +205,7 @@ class KronReduction:
             rate: shape (arcs, B).
         """
         rates, shares = rate.take(self._varying_flows, 0), routes.rate.take(self._varying_arcs, 0)
-        work: Floats = np.empty((self._change.stop, stock.shape[1]))
+        work: Floats = np.zeros((self._change.stop, stock.shape[1]))
         mean: Floats = work[self._masses]
         flows, passing, sent_rows = work[self._flows], work[self._passing], work[self._sent_rows]
         varying_rows, change, sums = work[self._varying_rows], work[self._change], [work[rows] for rows in self._sums]
