@@ -618,9 +618,23 @@ def test_all_of_a_stock_is_all_of_it(tmp_path: Path) -> None:
         (["Use", 1999, "Copper", 5, "kg/m"], r"line 3: .* give a part"),
         (["Use", 1999, "Copper", 5, "kt/year"], r"line 3: .* an amount in kt"),
         (["Use", 1999, "Copper", 5, ""], r"line 3: no unit"),
+        (
+            ["Mine", 1999, "Copper", 5, "%"],
+            r"stocks\.csv: 0\.05 of 'Mine' in 1999 is Copper, but it is a source, and has",
+        ),
+        (["Dump", 1999, "Copper", 5, "%"], r"stocks\.csv: 0\.05 of 'Dump' in 1999 is Copper, but it is a sink, and is"),
     ],
 )
 def test_what_is_wrong_with_substances_in_stocks(tmp_path: Path, row: Row, fault: str) -> None:
     """The line is named, and the nearest substance."""
     with pytest.raises(CirlError, match=fault):
-        stored(tmp_path, [["Use", 1999, "", 100, "kt"], row])
+        stored(tmp_path, [["Use", 1999, "", 100, "kt"], row, *([end, 1999, "", 100, "kt"] for end in ("Mine", "Dump"))])
+
+
+def test_stocks_of_sources_that_are_several_are_refused(tmp_path: Path) -> None:
+    """What leaves a mine in two contents comes from two of them, and nobody said how its stock is divided."""
+    rows: list[Row] = [["Mine", end, 2000, "", 10, "kt/year", ""] for end in ("Product", "Dump")]
+    rows += [["Mine", end, 2000, "Copper", part, "%", ""] for end, part in (("Product", 0), ("Dump", 4))]
+    stocks = table(tmp_path / "stocks.csv", [["Mine", 1999, "", 100, "kt"]], LONG)
+    with pytest.raises(CirlError, match="stocks: what leaves 'Mine' differs in content"):
+        imported(tmp_path, rows, stocks=stocks)

@@ -16,7 +16,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.importing.balances import Change, Processes, ProcessKind, Reconciliation, Residual
 from cirl_marl.importing.definition import DefinitionWriter, ImportedFiles, identifiers
-from cirl_marl.importing.flow_table import FlowTable, read_flows, read_stocks
+from cirl_marl.importing.flow_table import FlowTable, StockKey, read_flows, read_stocks
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Role
 from cirl_marl.records.files import publish_folder, write_table
@@ -105,6 +105,7 @@ def import_flows(
     table = Processes(table, holders).mix_substances()
     processes = Processes(table, holders)
     _check_stores(processes, stores)
+    _check_stock_contents(stocks, processes, contents)
     reconciliation: Reconciliation | None = None
     residuals = processes.residuals
     if not reconcile:
@@ -177,6 +178,24 @@ def _matching_processes(table: FlowTable, patterns: Sequence[str], label: str) -
             raise CirlError(f"{table.name}: {label}: {unknown_name('process', pattern, names)}")
         processes += matches
     return list(dict.fromkeys(processes))
+
+
+def _check_stock_contents(
+    path: Path | None, processes: Processes, contents: Mapping[str, Mapping[StockKey, float]]
+) -> None:
+    """Refuse contents of stocks that flows alone decide.
+
+    Raises:
+        CirlError: naming the table, the substance and the process.
+    """
+    remedies = {
+        ProcessKind.SOURCE: "is a source, and has what leaves it; give the content of its flows",
+        ProcessKind.SINK: "is a sink, and is empty at the start; leave it out",
+    }
+    for substance, parts in contents.items():
+        for (_, process, year), part in parts.items():
+            if remedy := remedies.get(processes.kinds[process]):
+                raise CirlError(f"{path}: {part:.4g} of '{process}' in {year} is {substance}, but it {remedy}")
 
 
 def _stock_processes(table: FlowTable, stocks: Mapping[tuple[str, str, int], float]) -> list[str]:

@@ -11,6 +11,7 @@ from typing import Annotated
 
 import numpy as np
 
+from cirl_marl.errors import CirlError
 from cirl_marl.importing.balances import Processes, ProcessKind
 from cirl_marl.importing.flow_table import Connection, FlowTable
 from cirl_marl.network import Floats
@@ -130,6 +131,9 @@ class DefinitionWriter:
             pairs = self._pairs_from(process)
             if self._is_alike(pairs):
                 self._sources[self._nodes[process]] = pairs
+            elif process in {name for _, name, _ in self.stocks}:
+                fault = f"what leaves '{process}' differs in content, which makes it a source for each flow"
+                raise CirlError(f"stocks: {fault}; leave its stock out, or give each part of it a name in both tables")
             else:
                 titles |= {pair: f"{process} for {pair.target} {pair.type}".rstrip() for pair in pairs}
         ids = identifiers([*self._nodes.values(), *self._arcs.values(), *titles.values()])
