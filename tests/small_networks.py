@@ -26,6 +26,7 @@ from cirl_marl import (
     Role,
     Series,
     Service,
+    Substance,
     load_network,
 )
 from cirl_marl.definitions.catalogue import families
@@ -39,6 +40,7 @@ from cirl_marl.network.disturbances import (
     RandomWalk,
     Seasonal,
 )
+from cirl_marl.network.elements import Lifetime
 from cirl_marl.network.series import Value, extremes
 from cirl_marl.network.uncertainty import CAPACITY, Spread
 
@@ -206,6 +208,75 @@ def cycle(interval: float = 1.0, hoarded: float = 40.0) -> Network:
     )
     episode = Episode(control_interval=interval, horizon=4)
     return Network(name="cycle", nodes=nodes, arcs=arcs, services=services, episode=episode)
+
+
+def mill(seed: int) -> Network:
+    """Return ore and two kinds of scrap, one of them sorted, of which products with little copper are made at a cost.
+
+    In half of the networks these have a lifetime.
+    """
+    rng = np.random.default_rng(seed)
+    cost = iter(rng.uniform(0.2, 3.0, 4).tolist())
+    high = float(rng.uniform(6, 12))
+    order = Control(kind=ControlKind.FLOW, low=0.0, neutral=2.0, high=high)
+    sorting = Control(
+        kind=ControlKind.TRANSFER, low=0.1, neutral=0.1, high=float(rng.uniform(0.3, 0.8)), substances=("copper",)
+    )
+    scrap = [
+        Node(id=name, initial=(200.0, 200.0), content={"copper": float(rng.uniform(0.01, 0.06))})
+        for name in ("cars", "cans")
+    ]
+    use: dict[str, Any] = {"rate": 0.2}
+    if rng.random() < 0.5:
+        use = {"lifetime": Lifetime(mean=6.0, deviation=2.0, distribution="normal")}
+    nodes = (
+        Node(id="ore", role=Role.NONRENEWABLE_RESERVOIR, initial=(200.0, 200.0)),
+        *scrap,
+        Node(id="sorter", stores=False),
+        Node(id="melt", stores=False),
+        Node(id="use", initial=(30.0, 30.0), content={"copper": 0.01}, **use),
+        Node(id="landfill", role=Role.LANDFILL),
+    )
+    flows = {"ore": "melt", "cars": "sorter", "cans": "melt"}
+    orders = (
+        Arc(
+            id=f"{donor}_in",
+            donor=donor,
+            recipient=to,
+            law=Law.CONTROLLED,
+            control=order,
+            accounts={"cost": next(cost)},
+        )
+        for donor, to in flows.items()
+    )
+    arcs = (
+        *orders,
+        Arc(id="sorted", donor="sorter", recipient="melt", law=Law.SHARE),
+        Arc(
+            id="rejects",
+            donor="sorter",
+            recipient="landfill",
+            law=Law.SHARE,
+            share=0.05,
+            control=sorting,
+            accounts={"cost": next(cost)},
+        ),
+        Arc(id="made", donor="melt", recipient="use", law=Law.SHARE),
+        Arc(id="left", donor="use", recipient="landfill", law=Law.SHARE),
+    )
+    products = Service(id="products", provider="made", quantity="flow", low=float(rng.uniform(5, 12)))
+    clean = replace(products, id="clean", substance="copper", low=0.0, high=float(rng.uniform(0.005, 0.03)))
+    return Network(
+        name="mill",
+        nodes=nodes,
+        arcs=arcs,
+        services=(products, clean),
+        substances=(Substance(id="copper", scale=0.01),),
+        accounts=(Account(id="cost", unit="EUR_2023"),),
+        mass_unit="t",
+        time_unit="year",
+        episode=Episode(control_interval=1.0, horizon=4),
+    )
 
 
 def without_lifetimes(network: Network) -> Network:

@@ -13,6 +13,8 @@ import pytest
 from conftest import random_network, with_substances
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
+from numpy.typing import ArrayLike
+from small_networks import mill
 from test_substances import COPPER, EXAMPLE, sorter, substances_networks
 
 from cirl_marl import (
@@ -263,7 +265,9 @@ def test_bounds_allow_what_idle_supplies_bring(refilled: bool) -> None:
     assert run.episode_circularity[0] <= limit.objective + 1e-6
 
 
-def controlled_by_mpc(network: Network, horizon: int | None = None, demanded: float = 1.0, **options: Any) -> Rollout:
+def controlled_by_mpc(
+    network: Network, horizon: int | None = None, demanded: ArrayLike = 1.0, **options: Any
+) -> Rollout:
     """Return an episode of MPC from the middle of the initial ranges."""
     env = MultiAgentVectorEnv(network, num_envs=1)
     start = episode_start(env)
@@ -295,6 +299,7 @@ def booked() -> Network:
         ({"at_most": {"scrap": 12.0}}, 24.0, 12.0),
         ({"at_most": {"scrap/year": 2.5}}, 21.0, 15.0),
         ({"aim": {"circularity": 1.0, "scrap": 3.0}}, 36.0, 0.0),
+        ({"aim": "ore"}, 18.0, 18.0),
         ({"aim": "ore", "horizon": 2}, 18.0, 18.0),
         ({"aim": "ore", "at_most": {"scrap": 12.0}}, 24.0, 12.0),
     ],
@@ -306,6 +311,19 @@ def test_mpc_keeps_budgets_and_aims_beside_contents(options: dict[str, Any], ore
     np.testing.assert_allclose(run.accounts[0], [ore, scrap], atol=0.02)
     yearly = run.bookings[0, 1]
     assert yearly.max() <= 2.5 + 1e-3 or "scrap/year" not in options.get("at_most", {})
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize(("seed", "horizon"), [(16, None), (104, None), (4, 2)])
+def test_mpc_delivers_what_some_actions_deliver(seed: int, horizon: int | None) -> None:
+    """Whatever products of ore and scrap cost: of each service as much as constant actions that are drawn."""
+    network, rng = mill(seed), np.random.default_rng(seed)
+    plan = bound(network)
+    run = simulate_plan(replace(plan, actions=np.tile(rng.uniform(-1, 1, plan.actions.shape[1]), (4, 1))))
+    demand = np.maximum(run.episode_levels[0] - 1e-6, 0.0)
+    controlled = controlled_by_mpc(network, horizon, demand, aim="cost")
+    assert (controlled.episode_levels[0] >= demand - 2e-4).all()
+    assert controlled.accounts[0, 0] <= run.accounts[0, 0]
 
 
 def test_windows_weigh_accounts_as_the_simulator_does() -> None:

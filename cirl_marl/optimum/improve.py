@@ -52,7 +52,9 @@ the optimum of Haverly's second pooling problem, of as many uniform ones 3."""
 LEAP = 2.0
 """Half-width of the trust region, all of the range, of a step to what is not made any more, as it is too impure."""
 DEARER = 10.0
-"""By what the price of a content rises that lacks where no step helps: of contents the bound knows no price."""
+"""By what the price of a service rises that lacks where no step helps: beside contents the bound knows too low ones."""
+STALL = 0.05
+"""Part of what is charged for services that lack, which a step has to gain if the price is to stay beside contents."""
 TOLERATED_SHORTFALL = 1e-4
 """What a service may lack of its demand without a further round: a hundredth of a gap of 1 %."""
 
@@ -91,7 +93,8 @@ def improve_plan(
         constant = np.random.default_rng(start).choice([-1.0, 0.0, 1.0], bound.actions.shape[1])
         actions = np.broadcast_to(constant, bound.actions.shape) if start else bound.actions
         report = partial(_tell, progress, start, starts)
-        plans.append(climb(replace(bound, actions=actions), trials, prices(bound), rounds, enough, report))
+        plan, _ = climb(replace(bound, actions=actions), trials, prices(bound), rounds, enough, report)
+        plans.append(plan)
     if starts == 1:
         return plans[0]
     runs, price = [simulate_plan(plan) for plan in plans], prices(bound)
@@ -127,8 +130,10 @@ def climb(
     rounds: int,
     enough: Callable[[Any], bool] = lambda run: False,
     progress: Callable[[float], None] = lambda share: None,
-) -> P:
-    """Return a plan with better actions, by linear programs around episodes, from its own.
+) -> tuple[P, Floats]:
+    """Return a plan with better actions, by linear programs around episodes, from its own, and the last prices.
+
+    The price of a service rises that lacks where contents are demanded and no step helps.
 
     Args:
         plan: with the actions to start from.
@@ -142,14 +147,14 @@ def climb(
     lack, excess = np.zeros(len(demand)), np.zeros(len(aims.budgets))
     best, run = plan, trials.simulate(plan)
     value, trust, slopes = trials.value(run, price), TRUST, None
-    contents = np.flatnonzero([bool(service.substance) for service in plan.network.services])
-    is_leap = False
+    is_cheap, is_leap = any(service.substance for service in plan.network.services), False
     for done in range(rounds):
-        if trust < SMALLEST and (demand - run.episode_levels[0])[contents].max(initial=0.0) > TOLERATED_SHORTFALL:
+        is_lacking = demand - run.episode_levels[0] > TOLERATED_SHORTFALL
+        if trust < SMALLEST and is_cheap and is_lacking.any():
             is_leap = not is_leap
             trust = LEAP
             if not is_leap:
-                price[contents] *= DEARER
+                price[: len(demand)][is_lacking] *= DEARER
                 value, trust = trials.value(run, price), TRUST
         if trust < SMALLEST or enough(run):
             break
@@ -183,12 +188,14 @@ def climb(
             best, run = _with_actions(best, better[0]), better[1]
             lack = np.maximum(demand - run.episode_levels[0], 0.0)  # a step lacks about what the last one did
             excess = aims.excess(run)
-            value, trust, slopes = value + gain, min(1.0, 2 * trust), None
-            is_leap = False
+            value, slopes = value + gain, None
+            is_stalled = is_cheap and gain < STALL * float(price[: len(demand)] @ lack)
+            trust = 0.0 if is_stalled else min(1.0, 2 * trust)
+            is_leap = is_leap and is_stalled
         else:
             trust = 0.0 if is_leap else trust / 4
     progress(1.0)
-    return best
+    return best, price
 
 
 def _with_actions(plan: P, actions: Floats) -> P:

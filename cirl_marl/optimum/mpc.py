@@ -432,7 +432,10 @@ class MPC(Planner):
             ahead = plan.task.intervals.start - last.task.intervals.start
             places = np.minimum(np.arange(ahead, ahead + len(plan.actions)), len(last.actions) - 1)
             plan = planner.better_of(plan, [last.actions[places]] * len(planner.futures))
-        courses = [climb_window(future, plan.task, plan.actions, self._weight) for future in planner.futures]
+        climbs = [climb_window(future, plan.task, plan.actions, self._weight) for future in planner.futures]
+        courses, prices = zip(*climbs, strict=True)
+        if plan.task.has_to_serve:
+            plan = planner.at_price(plan, np.max(prices, axis=0))
         firsts = [course[0] for course in courses]
         for first in (*firsts, np.mean(firsts, axis=0))[: None if len(courses) > 1 else 1]:
             plan = planner.better_of(plan, [np.concatenate([first[None], course[1:]]) for course in courses])

@@ -52,8 +52,10 @@ class WindowEpisode:
         return np.asarray(self.levels.mean(axis=2))
 
 
-def climb_window(future: Future, task: WindowTask, actions: Floats, service_weight: float | None) -> Floats:
-    """Return better actions of a window, shape (intervals, entries).
+def climb_window(
+    future: Future, task: WindowTask, actions: Floats, service_weight: float | None
+) -> tuple[Floats, Floats]:
+    """Return better actions of a window, shape (intervals, entries), and the price that they needed, as of the task.
 
     Args:
         future: that is planned for.
@@ -64,7 +66,7 @@ def climb_window(future: Future, task: WindowTask, actions: Floats, service_weig
     share, aims = len(task.intervals) / future.horizon, future.aims_of(task)
     plan = WindowActions(future.network, future.admissible.agents, task.stock, actions, service_weight, aims)
     if slopes_of(plan, future.dynamics) > MOST_SLOPES:
-        return actions
+        return actions, task.price
 
     def simulate(trial: WindowActions) -> WindowEpisode:
         outcome = future.carry_out(task, trial.actions)
@@ -87,4 +89,5 @@ def climb_window(future: Future, task: WindowTask, actions: Floats, service_weig
     budgets = len(task.limits)
     services = np.zeros(len(demand)) if task.demand is None else task.price[budgets:]
     price = np.concatenate([services, task.price[:budgets] / (share * future.aims.sizes[:budgets])])
-    return climb(plan, trials, price, ROUNDS).actions
+    better, price = climb(plan, trials, price, ROUNDS)
+    return better.actions, np.append(task.price[:budgets], price[: len(task.price) - budgets])

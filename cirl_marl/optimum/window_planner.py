@@ -524,15 +524,31 @@ class WindowPlanner:
     def better_of(self, plan: WindowPlan, actions: Sequence[Floats]) -> WindowPlan:
         """Return a plan, or in its place other actions of its intervals if they do better at the same prices.
 
-        Actions are those in each future, shape (intervals, entries), the first of which are the same in all.
+        Where demands have to be met they must not lack more, however much that saves. Actions are those in each future,
+        shape (intervals, entries), the first of which are the same in all.
         """
         outcomes = [future.carry_out(plan.task, course) for future, course in zip(self.futures, actions, strict=True)]
         level = np.mean([np.minimum(outcome.level, 1.0).mean(axis=0) for outcome in outcomes], axis=0)
         bookings = np.mean([outcome.bookings for outcome in outcomes], axis=0)
         value = float(np.mean([outcome.value for outcome in outcomes]))
         other = replace(plan, actions=actions[0], level=level, bookings=bookings, value=value)
+        if plan.task.has_to_serve and self._shortage(other) > self._shortage(plan) + ROUGH_SHORTFALL:
+            return plan
         merit = self._merit(other, plan.task.price)
         return replace(other, merit=merit) if merit > self._merit(plan, plan.task.price) else plan
+
+    def at_price(self, plan: WindowPlan, price: Floats) -> WindowPlan:
+        """Return a plan at another price of what is exceeded and lacks, shape (budgets + services,)."""
+        return replace(plan, task=replace(plan.task, price=price), merit=self._merit(plan, price))
+
+    def _shortage(self, plan: WindowPlan) -> float:
+        """Return the sum of the parts by which budgets are exceeded and of what services lack."""
+        task, shortage = plan.task, 0.0
+        if len(task.limits):
+            shortage += float(np.maximum(0.0, plan.bookings.sum(axis=0) - task.limits).sum())
+        if task.demand is not None:
+            shortage += float(np.maximum(0.0, task.demand - plan.level).sum())
+        return shortage
 
     def _merit(self, plan: WindowPlan, price: Floats) -> float:
         """Return the objective of a plan, less what it exceeds and lacks at a price, shape (budgets + services,)."""

@@ -76,6 +76,11 @@ class WindowTask:
         default_factory=lambda: EMPTY
     )
 
+    @property
+    def has_to_serve(self) -> bool:
+        """Whether demands and budgets hold here, whatever they cost, not at a price beside that of later intervals."""
+        return self.later is None and not self.is_redrawn
+
 
 @positional_record
 class WindowPlan:
