@@ -681,3 +681,20 @@ def test_an_unknown_distribution_is_one_fault(tmp_path: Path) -> None:
     with pytest.raises(DefinitionError) as error:
         load_network(path)
     assert str(error.value).count("\n") == 0 and "unknown value 'norml'. Did you mean 'normal'?" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("before", "key", "fault"),
+    [
+        ("[arcs.rejects]", "content", "arcs.rejects.content: a flow, or a batch, has the content of its donor when it"),
+        ("[nodes.wires]", "transfer", "nodes.wires.transfer: state the transfer of the arcs that leave it"),
+    ],
+)
+def test_contents_are_of_nodes_and_transfers_of_arcs(before: str, key: str, fault: str, tmp_path: Path) -> None:
+    """Where the other is stated nothing that is spelt alike is offered."""
+    path = tmp_path / "steel.toml"
+    addition = f'{before}\n{key}.copper = {{ value = 1, unit = "%", source = "made up" }}'
+    path.write_text(EXAMPLE.read_text().replace(before, addition))
+    with pytest.raises(DefinitionError) as error:
+        load_network(path)
+    assert fault in str(error.value) and "Did you mean" not in str(error.value)

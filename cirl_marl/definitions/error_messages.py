@@ -60,6 +60,14 @@ def _bare_word(error: str, line: str, column: int) -> str:
     return word if re.search(r"[^\W\d]", word) else ""
 
 
+MISPLACED: dict[tuple[str, ...], str] = {
+    ("arcs", "series"): "write flow = { times = […], values = […], time_unit = …, unit = …, source = … }",
+    ("arcs", "content"): "a flow, or a batch, has the content of its donor when it leaves; state that of a node",
+    ("nodes", "transfer"): "state the transfer of the arcs that leave it",
+}
+"""What to write instead of keys of a node or an arc, which has none of that name."""
+
+
 def validation_mistakes(error: ValidationError, model: type[BaseModel]) -> list[str]:
     """Say each pydantic error in the words of the file: key, value, nearest valid name."""
     return [_mistake(dict(item), model) for item in error.errors()]
@@ -70,8 +78,8 @@ def _mistake(item: Mapping[str, Any], model: type[BaseModel]) -> str:
     location = [str(part) for part in parts]
     keys = [part for part in parts if not str(part).startswith("<")]
     path = "".join(f", entry {key + 1}" if isinstance(key, int) else f".{key}" for key in keys).lstrip(".,") or "file"
-    if item["type"] == "extra_forbidden" and location[::2] == ["arcs", "series"]:
-        return f"{path}: write flow = {{ times = […], values = […], time_unit = …, unit = …, source = … }}"
+    if item["type"] == "extra_forbidden" and tuple(location[-3::2]) in MISPLACED:
+        return f"{path}: {MISPLACED[tuple(location[-3::2])]}"
     if item["type"] == "extra_forbidden" and location[-1] in ("disturbed_by", "disturbed_as"):
         numbers = "rates, flows, shares, capacities (of a control), stretches (of lifetimes) and bands"
         return f"{path}: only {numbers} can be disturbed"
