@@ -214,7 +214,7 @@ def test_what_cannot_be_asked_for_is_told() -> None:
         ({"aim": "cost", "at_most": {"cost": 1.0}}, "kept as low as can be already"),
         ({"aim": "cost", "service_weight": 1.0}, "service_weight goes with"),
         ({"aim": "cost", "uncertain": True}, "go with a certain future"),
-        ({"aim": {"cost": 1.0, "cots": 2.0}}, "unknown account 'cots'.*Did you mean 'cost'"),
+        ({"aim": {"cost": 1.0, "cots": 2.0}}, "unknown account.* 'cots'.*Did you mean 'cost'"),
         ({"aim": {"cost": float("inf")}}, "the weight of 'cost' must be a finite number"),
         ({"aim": {"circularity": -1.0, "cost": 1.0}}, "the weight of 'circularity' must not be negative"),
         ({"aim": {"circularity": 0.0}}, "weights of these that are not all 0"),
@@ -321,6 +321,13 @@ def test_units_of_files_are_converted_and_refused(tmp_path: Path) -> None:
     ):
         file.write_text(text.replace(rate, wrong), encoding="utf-8")
         with pytest.raises(CirlError, match=f"arcs.virgin_fibre.accounts.*{message}"):
+            load_network(file)
+    for unit, message in (
+        ("kEUR", "'kEUR' is unknown; if it is a currency, give the year"),
+        ("foo", "'foo' is not def"),
+    ):
+        file.write_text(text.replace('unit = "EUR_2023"', f'unit = "{unit}"', 1), encoding="utf-8")
+        with pytest.raises(CirlError, match=rf"city\.toml: accounts\.cost\.unit: unit '{unit}'.*{message}"):
             load_network(file)
 
 

@@ -69,11 +69,14 @@ class Converter:
             NetworkError: with every inconsistent unit and unusable column, or else every fault of the network.
         """
         table = self.table
-        for key, unit, base in (("mass", table.units.mass, "kg"), ("time", table.units.time, "s")):
+        units = [("units.mass", table.units.mass, "kg"), ("units.time", table.units.time, "s")]
+        accounts: Any = table.accounts
+        units += [(f"accounts.{id_}.unit", part.unit, part.unit) for id_, part in accounts.items()]
+        for path, unit, base in units:
             try:
                 factor(unit, base)
             except CirlError as error:
-                raise NetworkError(table.name, [f"units.{key}: {error}"]) from None
+                raise NetworkError(table.name, [f"{path}: {error}"]) from None
         for key, kind, scale in (("stock", "mass", table.scales.stock), ("flow", "flow", table.scales.flow)):
             self.scales[kind] = self._number(scale, kind, f"scales.{key}")
             if self.scales[kind] <= 0:
