@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from small_networks import city, with_lambda
+from test_each_service import town as scarce_town
 from test_supply import town
 from typer.testing import CliRunner
 
@@ -36,7 +37,6 @@ from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
 from cirl_marl.evaluation.account_front import AccountFront, _Sweep, volume_dominated
 from cirl_marl.network.elements import Role
 from cirl_marl.optimum import bound, improve_plan, simulate_plan, supply_limits
-from cirl_marl.optimum.bounds import highest_level
 from cirl_marl.optimum.supply_limits import _with_ends, with_supply_limits
 
 
@@ -66,6 +66,41 @@ def test_the_front_of_two_aims_is_proved_and_reached(tmp_path: Path) -> None:
         account_front(with_lambda(paper), ("circularity", "moved"), min_service=0.9)
     with pytest.raises(CirlError, match="nothing to weigh"):  # less ore is less of both
         account_front("copper_world", ("circularity", "emissions"), min_service=1.0)
+
+
+@pytest.mark.slow
+def test_a_service_may_come_first(tmp_path: Path) -> None:
+    """Against an account it is the front of that account against it, the other way round; beside two it has planes."""
+    network = city().with_options(episode={"horizon": 10})
+    (service,) = (part.id for part in network.services)
+    front, other = (account_front(network, axes, points=4) for axes in ((service, "cost"), ("cost", service)))
+    assert front.signs.tolist() == [1.0, -1.0] and front.units == ("1", "EUR_2023")
+    np.testing.assert_allclose(front.demands[[0, -1], 0], other.bounds[[0, -1]], rtol=1e-4)
+    proved = other.at(front.bounds[:, None]) / front.demands[:, 0]  # between demands planes prove a bit less
+    assert (proved <= 1 + 1e-6).all() and (proved >= 0.99).all()
+    assert front.volumes[1] >= 0.98 * front.volumes[0]
+    file = tmp_path / "city.toml"
+    write_network(network, file)
+    words = ["pareto", str(file), "--between", f"{service},cost,emissions", "--points", "3"]
+    result = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "front")])
+    assert result.exit_code == 0, result.output
+    three = account_front(network, (service, "cost", "emissions"), points=3)
+    assert (three.at(three.plans[:, 1:]) >= three.plans[:, 0] - 1e-6).all()
+    assert 0.98 * three.volumes[0] <= three.volumes[1] <= three.volumes[0] * (1 + 1e-6)
+
+
+def test_two_services_that_need_the_same_are_weighed() -> None:
+    """The more of one, the less of the other: proved, reached, and as dear as programs nearby say."""
+    network = scarce_town(reserve=12.0, cars=0.0, homes=0.0)
+    front = account_front(network, ("mobility", "housing"), points=4)
+    assert (np.diff(front.bounds) < 0).all() and front.bounds[-1] == pytest.approx(0.0, abs=1e-4)
+    assert (front.at(front.plans[:, 1:]) >= front.plans[:, 0] - 1e-6).all()
+    proved, achieved = front.volumes
+    assert 0.99 * proved <= achieved <= proved * (1 + 1e-6)
+    level = front.demands[1, 0]
+    nearby = [bound(network, aim="mobility", min_service=[0.0, level + way * 1e-3]).objective for way in (-1, 1)]
+    slopes = np.diff([nearby[0], front.bounds[1], nearby[1]]) / 1e-3
+    assert slopes.min() - 1e-2 <= front.prices[1, 0] <= slopes.max() + 1e-2
 
 
 @pytest.mark.slow
@@ -136,9 +171,9 @@ def test_plans_that_do_more_than_is_demanded_dominate_no_more_than_is_proved() -
     ("axes", "message"),
     [
         (("circularity", "emisions"), "Did you mean 'emissions'"),
-        (("cost", "circularity"), "then one or two other accounts or services"),
-        (("cost", "cost"), "then one or two other"),
-        (("circularity",), "then one or two other"),
+        (("cost", "circularity"), "accounts or services, the first of which may be 'circularity'"),
+        (("cost", "cost"), "two or three different"),
+        (("circularity",), "two or three different"),
         (("circularity", "emissions"), "give min_service, at which they are weighed, of"),
     ],
 )
@@ -291,6 +326,6 @@ def test_fronts_reach_the_highest_service_that_there_is() -> None:
     sweep = _Sweep(network, ("circularity", "driving"), 3, np.zeros(1), lambda activity, share: None)
     sweep._programs = _with_ends(network, {"mined_ore": np.full(1, 1.0), "mined_tailings": np.full(1, 1.0)})
     sweep.run(("circularity", "driving"), {}, np.zeros(1))
-    most = highest_level(network, 0, np.zeros(1))
+    most = bound(network, aim="driving").objective
     assert np.max(sweep.demands) == pytest.approx(most, abs=1e-5)
-    assert highest_level(sweep._programs, 0, np.zeros(1)) < most - 0.01
+    assert bound(sweep._programs, aim="driving").objective < most - 0.01

@@ -25,14 +25,14 @@ from cirl_marl import (
     load_network,
 )
 from cirl_marl.cli.episodes import simulate
-from cirl_marl.controllers import Constant, Neutral
+from cirl_marl.controllers import Constant, Neutral, Random
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.definitions.reader import write_network
 from cirl_marl.evaluation import compare, solve_baseline
 from cirl_marl.evaluation.pareto import pareto_front
 from cirl_marl.optimum import Plan, bound, envelope, improve_plan, search, simulate_plan
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.bounds import highest_level, highest_service
+from cirl_marl.optimum.bounds import highest_service
 from cirl_marl.optimum.mpc import MPC
 from cirl_marl.optimum.open_loop import Optimum
 from cirl_marl.optimum.options import starting_stocks
@@ -150,11 +150,36 @@ def test_the_service_that_cannot_be_had_is_named() -> None:
 def test_the_highest_level_of_a_service_beside_what_another_asks() -> None:
     """The more of what is scarce homes have, the less there is for cars; a bit more has no solution."""
     scarce = town(reserve=12.0, cars=0.0, homes=0.0)
-    most = [highest_level(scarce, 0, np.array([0.0, demand])) for demand in (0.0, 0.3, 0.5)]
+    aim = scarce.services[0].id
+    most = [float(bound(scarce, aim=aim, min_service=[0.0, demand]).objective) for demand in (0.0, 0.3, 0.5)]
     assert most[0] > most[1] + 0.05 > most[2] + 0.1
     assert bound(scarce, min_service=[most[1] - 1e-5, 0.3]).levels[1] >= 0.3 - 1e-5
     with pytest.raises(CirlError, match="no actions reach"):
         bound(scarce, min_service=[most[1] + 1e-4, 0.3])
+
+
+def test_weighed_levels_have_bounds_and_plans() -> None:
+    """Beside λ̄ or alone; multipliers prove it; weights below 0, other names, and MPC are refused."""
+    scarce = town(reserve=12.0, cars=0.0, homes=0.0)
+    alone = bound(scarce, aim={"housing": 1.0})
+    assert str(alone).startswith("bound of town over 8 steps: level of housing ≤ 0.88")
+    weighed = bound(scarce, aim={"circularity": 0.01, "mobility": 1.0, "housing": 2.0})
+    assert weighed.verify().bound == weighed.objective
+    run = simulate_plan(improve_plan(replace(weighed, actions=np.zeros_like(weighed.actions))))
+    value = 0.01 * run.episode_circularity[0] + run.episode_levels[0] @ [1.0, 2.0]
+    assert weighed.aims.value(run) == pytest.approx(value)
+    assert value <= weighed.objective <= value + 0.01 * abs(value)
+    drawn = rollout(MultiAgentVectorEnv(scarce, num_envs=32), Random())
+    values = 0.01 * drawn.episode_circularity + drawn.episode_levels @ [1.0, 2.0]
+    assert (values <= weighed.objective + 1e-9).all() and values.max() > 0.3 * weighed.objective
+    for aim, message in (
+        ({"housing": -1.0}, "the weight of 'housing' must not be negative, got -1"),
+        ("houses", "aim: unknown account or service 'houses'"),
+    ):
+        with pytest.raises(CirlError, match=message):
+            bound(scarce, aim=aim)
+    with pytest.raises(CirlError, match="aim: unknown account 'housing'"):
+        rollout(MultiAgentVectorEnv(scarce, num_envs=1), MPC(aim="housing"))
 
 
 def test_mpc_approaches_one_demand_and_leaves_the_other() -> None:

@@ -136,7 +136,7 @@ def pareto(
     ] = None,
     between: Annotated[
         str | None,
-        typer.Option(help="AIM,AIM[,AIM]: circularity or an account, against one or two accounts or services."),
+        typer.Option(help="AIM,AIM[,AIM]: two or three accounts or services; the first may be circularity."),
     ] = None,
     min_service: common.MinService = None,
     html: common.Html = None,

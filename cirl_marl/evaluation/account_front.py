@@ -29,7 +29,6 @@ from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import CIRCULARITY
 from cirl_marl.optimum import Bound, bound, improve_plan, simulate_plan
 from cirl_marl.optimum.aims import aims_of
-from cirl_marl.optimum.bounds import highest_level
 from cirl_marl.optimum.improve import shortage
 from cirl_marl.optimum.options import demanded_levels
 from cirl_marl.optimum.supply_limits import with_supply_limits
@@ -46,7 +45,7 @@ WITHIN_REACH = 1e-6
 
 @positional_record
 class AccountFront:
-    """λ̄, or the total of an account, at k demands on one or two other aims; d aims in all."""
+    """λ̄, the total of an account or the level of a service at k demands on one or two other aims; d aims in all."""
 
     network: Network
     axes: Annotated[tuple[str, ...], "what is aimed at, and what has demands"]
@@ -59,7 +58,7 @@ class AccountFront:
     shortages: Annotated[Floats, "most that a plan is short of a service or exceeds its budget, relative, shape (k,)"]
     as_usual: Annotated[Floats, "the aims under neutral control, shape (d,)"]
     is_limited: Annotated[Bools, "bounds that hold for episodes at least as good as ``least`` alone, shape (k,)"]
-    least: Annotated[float, "objective, which is λ̄ or minus a total"]
+    least: Annotated[float, "objective, which is λ̄, minus a total or a level"]
 
     @property
     def signs(self) -> Floats:
@@ -123,11 +122,11 @@ def account_front(
     points: int | None = None,
     progress: ProgressReport = lambda activity, share: None,
 ) -> AccountFront:
-    """Hold two or three aims against each other at a demanded service: λ̄ or an account, and accounts or services.
+    """Hold two or three of λ̄, accounts and services against each other at a demanded level of other services.
 
     Args:
         network: catalogue name, definition file, or network.
-        axes: ``circularity`` or an account, and one or two further accounts or services.
+        axes: two or three accounts or services, in place of the first perhaps ``circularity``.
         min_service: mean level of every service that is no aim, or of each, shape (services,); needed if there is one.
         scenario: of the definition; None is the default.
         points: how many demands on each other aim, at least 3; None: POINTS.
@@ -164,10 +163,14 @@ def _check_axes(network: Network, axes: Sequence[str]) -> None:
     for axis in axes:
         if axis not in names:
             raise CirlError(f"network '{network.name}': front: {unknown_name('aim', axis, names)}")
-    is_first = axes[:1] and axes[0] in (CIRCULARITY, *accounts)
-    if len(axes) not in (2, 3) or len(set(axes)) < len(axes) or not is_first or CIRCULARITY in axes[1:]:
-        choice = f"give '{CIRCULARITY}' or an account, then one or two other accounts or services"
+    if len(axes) not in (2, 3) or len(set(axes)) < len(axes) or CIRCULARITY in axes[1:]:
+        choice = f"give two or three different accounts or services, the first of which may be '{CIRCULARITY}'"
         raise CirlError(f"front of {', '.join(axes)}: {choice}")
+
+
+def _within_reach(level: float) -> float:
+    """Return what may be demanded where a level is the highest there is."""
+    return max(float(level) - WITHIN_REACH, 0.0)
 
 
 class _Sweep:
@@ -184,7 +187,7 @@ class _Sweep:
         self.demands: list[list[float]] = []
         self.solutions: list[Bound] = []
         self.runs: list[Rollout] = []
-        self._progress, self._aims = progress, aims_of(network, axes[0], None)
+        self._progress, self._aims = progress, aims_of(network, axes[0], None, with_services=True)
         self._accounts = [account.id for account in network.accounts]
         self._services = [service.id for service in network.services]
         progress("bounds and plans", 0.0)
@@ -200,7 +203,7 @@ class _Sweep:
             return self._carried_out(bound(self.definition, aim=axis, min_service=self.min_service))
         service = self._services.index(axis)
         levels = self.min_service.copy()
-        levels[service] = highest_level(self.definition, service, levels) - WITHIN_REACH
+        levels[service] = _within_reach(bound(self.definition, aim=axis, min_service=levels).levels[service])
         return self._carried_out(bound(self.definition, aim=self.axes[0], min_service=levels))
 
     def _carried_out(self, solution: Bound) -> Rollout:
@@ -219,21 +222,32 @@ class _Sweep:
             share = len(self.solutions) / self.points ** (len(self.axes) - 1)
             self._progress("bounds and plans", share)
             return
-        free, _ = self._best(budgets, levels)
+        free = self._best_of_last(last, self._best(budgets, levels)[0], budgets, levels)
         if last in self._accounts:
             place = self._accounts.index(last)
             best = bound(self.definition, aim=last, at_most=budgets, min_service=levels)
             ends = float(self._carried_out(best).accounts[0, place]), float(free.accounts[place])
         else:
             place = self._services.index(last)
-            most = highest_level(self.definition, place, levels, budgets) - WITHIN_REACH
-            ends = float(free.levels[place]), most
+            most = bound(self.definition, aim=last, at_most=budgets, min_service=levels).levels[place]
+            ends = float(free.levels[place]), _within_reach(most)
         is_range = ends[1] - ends[0] > TIGHTEST * abs(ends[1])
         for demand in np.linspace(*ends, self.points).tolist() if is_range else [max(ends)]:
             more = levels.copy()
             if last in self._services:
                 more[self._services.index(last)] = demand
             self.run(axes[:-1], {**budgets, last: demand} if last in self._accounts else budgets, more)
+
+    def _best_of_last(self, last: str, free: Bound, budgets: Mapping[str, float], levels: Floats) -> Bound:
+        """Return the bound with most of the ``last`` aim where the first, if it is a service, is as good as ``free``.
+
+        Many plans may have the highest level of a service.
+        """
+        if self.axes[0] not in self._services:
+            return free
+        first, most = self._place(self.axes[0]), levels.copy()
+        most[first] = _within_reach(free.levels[first])
+        return bound(self.definition, aim=last, at_most=budgets, min_service=most)
 
     def _best(self, budgets: Mapping[str, float], levels: Floats) -> tuple[Bound, bool]:
         """Return the bound on the first aim at some demands, and whether it is that of limited supplies.

@@ -1,4 +1,4 @@
-"""What is aimed at beside services: λ̄ and totals of accounts, weighed, and budgets; their rows of a program."""
+"""What is aimed at: λ̄, totals of accounts and levels of services, weighed, and budgets; their rows of a program."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.vintages import Lifetimes
 
 Aim = str | Mapping[str, float]
-"""``circularity``, an account that is kept low, or the weights of λ̄ and of minus the totals of accounts, by name."""
+"""``circularity``, an account that is kept low, or the weights of λ̄ and of minus the totals of accounts, by name.
+
+Bounds and plans take services as well, whose levels are kept high.
+"""
 PER_YEAR = "/year"
 """What follows the id of an account of which there is a budget per year."""
 RateTables = tuple[Floats, Floats, Floats]
@@ -74,24 +77,28 @@ class Budget:
 
 @positional_record
 class Aims:
-    """The objective, w·λ̄ − Σ c_i·(total of account i), and the budgets."""
+    """The objective, w·λ̄ − Σ c_i·(total of account i) + Σ v_s·(mean level of service s), and the budgets."""
 
     circularity: Annotated[float, "w, not negative"] = 1.0
     charges: Annotated[Mapping[int, float], "c by the position of the account"] = field(default_factory=dict)
     budgets: Annotated[tuple[Budget, ...], "what may be booked at most"] = ()
+    levels: Annotated[Mapping[int, float], "v, not negative, by the position of the service"] = field(
+        default_factory=dict
+    )
 
     @property
     def is_circular(self) -> bool:
         """Whether the objective is λ̄."""
-        return self.circularity == 1.0 and not self.charges
+        return self.circularity == 1.0 and not self.charges and not self.levels
 
     @property
     def account(self) -> int | None:
         """Position of the account that alone is kept low; None if there are other aims."""
-        return next(iter(self.charges)) if not self.circularity and [*self.charges.values()] == [1.0] else None
+        is_alone = not self.circularity and not self.levels
+        return next(iter(self.charges)) if is_alone and [*self.charges.values()] == [1.0] else None
 
     def objective(self, circularity: Floats | float, accounts: Floats) -> Floats:
-        """Return the objective, shape (...), of λ̄ and totals of the accounts, shape (accounts, ...)."""
+        """Return the objective but for levels, shape (...), of λ̄ and totals of the accounts, shape (accounts, ...)."""
         result: Floats = np.asarray(self.circularity * circularity, dtype=np.float64)
         for account, charge in self.charges.items():
             result = result - charge * accounts[account]
@@ -99,12 +106,14 @@ class Aims:
 
     def value(self, run: Rollout) -> float:
         """Return what the first episode of a rollout has of the objective."""
-        return float(self.objective(run.episode_circularity[0], run.accounts[0]))
+        levels = sum(weight * float(run.episode_levels[0, service]) for service, weight in self.levels.items())
+        return float(self.objective(run.episode_circularity[0], run.accounts[0])) + levels
 
     def size(self, network: Network, accounts: Floats) -> float:
         """Return how large the objective is, given totals of the accounts, shape (accounts,)."""
         account_sizes = sum(abs(charge * accounts[account]) for account, charge in self.charges.items())
-        return self.circularity * network.objective.circularity_scale + float(account_sizes)
+        levels = sum(self.levels.values())
+        return self.circularity * network.objective.circularity_scale + float(account_sizes) + levels
 
     def totals(self, run: EpisodeRecord) -> Floats:
         """Return what the first episode of a rollout books of each budget, shape (budgets,)."""
@@ -189,7 +198,8 @@ class Aims:
             return f"{account.id} ≥ {-limit:.{digits}g} {account.unit}"
         terms = [f"{self.circularity:g}·λ̄"] if self.circularity else []
         terms += [f"{-charge:+g}·{network.accounts[account].id}" for account, charge in self.charges.items()]
-        return f"{' '.join(terms)} ≤ {limit:.{digits}g}"
+        terms += [f"{weight:+g}·level of {network.services[s].id}" for s, weight in self.levels.items()]
+        return f"{' '.join(terms).removeprefix('+1·')} ≤ {limit:.{digits}g}"
 
 
 NO_AIMS = Aims()
@@ -208,25 +218,28 @@ def budget_texts(network: Network, aims: Aims) -> list[tuple[str, list[str]]]:
     return texts
 
 
-def aims_of(network: Network, aim: Aim, at_most: Mapping[str, float] | None) -> Aims:
-    """Return the aims that options of ``bound`` ask for.
+def aims_of(network: Network, aim: Aim, at_most: Mapping[str, float] | None, *, with_services: bool = False) -> Aims:
+    """Return the aims that options of ``bound`` ask for, among them, with ``with_services``, levels of services.
 
     Raises:
-        CirlError: for an unknown account, a weight or budget that is no finite number, a negative weight of λ̄, weights
-            that are all 0, or a budget of the account that alone is kept low.
+        CirlError: for an unknown account or service, a weight or budget that is no finite number, a negative weight of
+            λ̄ or a service, weights that are all 0, or a budget of the account that alone is kept low.
     """
     accounts = [account.id for account in network.accounts]
+    services = [service.id for service in network.services if with_services and service.id not in accounts]
+    names = [CIRCULARITY, *accounts, *services]
     if not isinstance(aim, str | Mapping):
         raise CirlError(f"aim: give '{CIRCULARITY}', an account, or {{name: weight}}, got {aim!r}")
     if not isinstance(at_most, Mapping | None):
         raise CirlError(f"at_most: give {{account: total}}, got {at_most!r}")
     weights = {aim: 1.0} if isinstance(aim, str) else dict(aim)
     for name, weight in weights.items():
-        if name not in (CIRCULARITY, *accounts):
-            raise CirlError(f"network '{network.name}': aim: {unknown_name('account', name, [CIRCULARITY, *accounts])}")
+        if name not in names:
+            kind = "account or service" if services else "account"
+            raise CirlError(f"network '{network.name}': aim: {unknown_name(kind, name, names)}")
         _check_number(f"aim: the weight of '{name}'", weight)
-    if weights.get(CIRCULARITY, 0.0) < 0:
-        raise CirlError(f"aim: the weight of '{CIRCULARITY}' must not be negative, got {weights[CIRCULARITY]:g}")
+        if name not in accounts and weight < 0:
+            raise CirlError(f"aim: the weight of '{name}' must not be negative, got {weight:g}")
     if not any(weights.values()):
         raise CirlError(f"aim: give '{CIRCULARITY}', an account, or weights of these that are not all 0, got {aim!r}")
     budgets: list[Budget] = []
@@ -243,8 +256,10 @@ def aims_of(network: Network, aim: Aim, at_most: Mapping[str, float] | None) -> 
             raise CirlError(f"at_most: '{account}' is kept as low as can be already; leave out its budget, or the aim")
         budget = Budget(accounts.index(account), float(most), account)
         budgets += _by_year(network, budget) if period else [budget]
-    charges = {accounts.index(name): float(w) for name, w in weights.items() if name != CIRCULARITY and w}
-    return Aims(float(weights.get(CIRCULARITY, 0.0)), charges, tuple(budgets))
+    charges = {accounts.index(name): float(w) for name, w in weights.items() if name in accounts and w}
+    places = {service.id: s for s, service in enumerate(network.services) if service.id in services}
+    levels = {places[name]: float(w) for name, w in weights.items() if name in services and w}
+    return Aims(float(weights.get(CIRCULARITY, 0.0)), charges, tuple(budgets), levels)
 
 
 def _by_year(network: Network, budget: Budget) -> Iterator[Budget]:

@@ -62,7 +62,7 @@ class Bound:
     objective: Annotated[
         float,
         "the bound, proved by ``verify()``: of λ̄, mass, with a service weight of λ̄/scale + w·service, or of what else "
-        "is aimed at, such as minus the total of an account",
+        "is aimed at, such as minus the total of an account, or the level of a service",
     ]
     value: Annotated[float, "the bound on λ̄, or with another objective λ̄ of the plan, mass"]
     service: Annotated[float, "mean service level of the plan"]
@@ -240,8 +240,9 @@ def bound(
             all in the middle, or with ``uncertain`` drawn as episodes draw them.
         service_weight: w ≥ 0; excludes ``min_service``.
         min_service: in [0, 1], for every service, or one for each, shape (services,).
-        aim: ``circularity``; the account whose total is kept as low as can be, the bound being on minus that; or the
-            weights of λ̄ and of minus the totals of accounts, by name.
+        aim: ``circularity``; the account whose total is kept as low as can be, the bound being on minus that; the
+            service whose mean level is kept as high; or the weights of λ̄, of minus the totals of accounts and of the
+            levels of services, by name.
         at_most: budgets: the highest total of accounts, by id, in their units; with ``/year`` after the id the highest
             amount of each year, not discounted.
         agents: who acts; None is the network's own choice.
@@ -269,7 +270,7 @@ def bound(
         levels = None if min_service is None else demanded_levels(definition, min_service)
         sampling = uncertain if isinstance(uncertain, Sampling) else Sampling()
         return uncertain_bound(definition, agents, initial, levels, degree, sampling, aims_of(definition, aim, at_most))
-    aims = aims_of(definition, aim, at_most)
+    aims = aims_of(definition, aim, at_most, with_services=True)
     if service_weight is not None and not aims.is_circular:
         raise CirlError(f"service_weight goes with the aim '{CIRCULARITY}', not with {aim!r}; demand min_service")
     admissible = Admissible.of(definition, agents)
@@ -336,28 +337,6 @@ def highest_service(network: Network) -> float:
     admissible = Admissible.of(network)
     problem = Programs(admissible, DEGREE, None).program(starting_stocks(admissible.lifetimes, None), 1.0)
     return 1.0 - _least_cut(problem, range(len(network.services)))
-
-
-def highest_level(
-    network: Network, service: int, min_service: Floats, at_most: Mapping[str, float] | None = None
-) -> float:
-    """Return the highest mean level that a program allows one service, beside what is demanded of the others.
-
-    Args:
-        network: from the middle of the initial ranges.
-        service: its position.
-        min_service: demanded of the others, shape (services,).
-        at_most: budgets, as for ``bound``.
-
-    Raises:
-        NoCertificate: for a network whose flows are not linear laws.
-        Infeasible: if the others cannot have what is demanded of them.
-    """
-    admissible, demand = Admissible.of(network), min_service.copy()
-    demand[service], others = 1.0, np.delete(np.arange(len(demand)), service)
-    start = starting_stocks(admissible.lifetimes, None)
-    problem = Programs(admissible, DEGREE, None).program(start, demand, aims=aims_of(network, CIRCULARITY, at_most))
-    return 1.0 - _least_cut(problem, [service], others.tolist())
 
 
 def _episode_network(network: str | Path | Network, scenario: str | None, horizon: int | None) -> Network:
@@ -481,15 +460,12 @@ def _unreached_services(problem: Program, min_service: Floats | None) -> str:
     return f"network '{network.name}': no actions reach a mean service level of {', '.join(levels)}{suffix}"
 
 
-def _least_cut(problem: Program, services: Sequence[int], beside: Sequence[int] = ()) -> float:
-    """Return the least number by which the levels demanded of ``services`` are lowered within reach.
-
-    Levels demanded of services ``beside`` these stay; of all else nothing is demanded.
-    """
+def _least_cut(problem: Program, services: Sequence[int]) -> float:
+    """Return the least number by which the levels demanded of ``services`` alone are lowered within reach."""
     first = len(problem.under_to) - len(problem.layout.network.services)
-    rows = [*range(first), *(first + s for s in (*beside, *services))]
+    rows = [*range(first), *(first + s for s in services)]
     # minimise t, one more variable, with mean level + t ≥ demanded level
-    allowance = sparse.csr_array((np.arange(len(rows)) >= first + len(beside))[:, None] * -1.0)
+    allowance = sparse.csr_array((np.arange(len(rows)) >= first)[:, None] * -1.0)
     cut = replace(
         problem,
         cost=np.append(np.zeros_like(problem.cost), 1.0),

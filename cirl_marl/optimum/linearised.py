@@ -268,6 +268,8 @@ def step_program(
     if is_absolute:
         scale = 1.0 if plan.service_weight is None else network.objective.circularity_scale
         cost[columns[:, imbalance]] += plan.aims.circularity / (steps * scale)
+    for service, weight in plan.aims.levels.items():
+        cost[columns[:, level + service]] -= weight / steps
     if later is not None:
         cost[columns[:, level:imbalance]] += later.level_cost
     cost += cost_later

@@ -243,6 +243,8 @@ class Programs:
             rates = over(self._ledger.rates(), intervals)
             totals, beside = account_rows(lifetimes, layout, initial, rates)
             cost, constant = -aims.objective(-cost, totals.toarray()), float(aims.objective(constant, beside))
+            for service, weight in aims.levels.items():
+                cost[layout.level + service :: layout.size] -= weight / steps
         if aims is not None and aims.budgets:
             rates = over(aims.rates(lifetimes.network), intervals)
             totals, beside = account_rows(lifetimes, layout, initial, rates)
