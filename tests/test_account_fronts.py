@@ -79,6 +79,7 @@ def test_a_service_may_come_first(tmp_path: Path) -> None:
     proved = other.at(front.bounds[:, None]) / front.demands[:, 0]  # between demands planes prove a bit less
     assert (proved <= 1 + 1e-6).all() and (proved >= 0.99).all()
     assert front.volumes[1] >= 0.98 * front.volumes[0]
+    np.testing.assert_allclose(front.at(2 * front.demands[-1:]), 1.0, atol=1e-5)
     file = tmp_path / "city.toml"
     write_network(network, file)
     words = ["pareto", str(file), "--between", f"{service},cost,emissions", "--points", "3"]

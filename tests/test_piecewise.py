@@ -397,7 +397,7 @@ def test_files_state_pieces_in_any_unit(tmp_path: Path) -> None:
     file.write_text(file.read_text(encoding="utf-8") + disturbance, encoding="utf-8")
     again = load_network(file)
     assert again.disturbed["arcs.new.accounts.cost"].by == "wage"
-    write_network(again, tmp_path / "again.toml")
+    write_network(again, str(tmp_path / "again.toml"))
     assert load_network(tmp_path / "again.toml").disturbed == again.disturbed
     for change, message in (
         (("0.025, 0.06", "0.06, 0.025"), r"arc 'new': accounts.cost: rates must rise, but 25 follows 60.*not convex"),

@@ -161,12 +161,12 @@ class _OtherScenarios(Mapping[str, Network]):
         return len(self._definition.names) - 1
 
 
-def write_network(network: Network, path: Path) -> None:
+def write_network(network: Network, path: str | Path) -> None:
     """Write a network built in Python as a definition file; its other scenarios are not written."""
     from cirl_marl.definitions.writer import definition_of
 
     text = definition_of(network)
-    write_atomically(path, lambda partial: partial.write_text(text, encoding="utf-8"))
+    write_atomically(Path(path), lambda partial: partial.write_text(text, encoding="utf-8"))
 
 
 def read_toml(path: Path) -> dict[str, Any]:

@@ -9,6 +9,7 @@ and the front the curve of marginal costs.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -59,6 +60,7 @@ class AccountFront:
     as_usual: Annotated[Floats, "the aims under neutral control, shape (d,)"]
     is_limited: Annotated[Bools, "bounds that hold for episodes at least as good as ``least`` alone, shape (k,)"]
     least: Annotated[float, "objective, which is λ̄, minus a total or a level"]
+    highest: Annotated[float, "level of a service that comes first, whatever is demanded"] = math.inf
 
     @property
     def signs(self) -> Floats:
@@ -78,7 +80,8 @@ class AccountFront:
         planes = self.signs[0] * self.bounds + ((points[:, None] - self.demands) * self.prices).sum(axis=2)
         limited = planes.min(axis=1, where=self.is_limited, initial=np.inf)
         always = planes.min(axis=1, where=~self.is_limited, initial=np.inf)
-        return np.asarray(self.signs[0] * np.minimum(always, np.maximum(limited, self.least)))
+        proved = np.minimum(np.minimum(always, np.maximum(limited, self.least)), self.highest)
+        return np.asarray(self.signs[0] * proved)
 
     @property
     def volumes(self) -> tuple[float, float]:
@@ -193,6 +196,7 @@ class _Sweep:
         progress("bounds and plans", 0.0)
         self.are_limited: list[bool] = []
         free = bound(network, aim=axes[0], min_service=min_service)
+        self._highest = free.objective if axes[0] in self._services else math.inf
         self._least = min(self._aims.value(self._plan_of_best(axis)) for axis in axes[1:])
         self._programs = with_supply_limits(free, self._least)
         self._has_limits = self._programs is not free.network
@@ -288,6 +292,7 @@ class _Sweep:
             as_usual=np.array(self._coordinates(as_usual)),
             is_limited=np.array(self.are_limited),
             least=self._least,
+            highest=self._highest,
         )
 
     def _prices(self, solution: Bound) -> list[float]:
