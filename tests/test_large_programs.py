@@ -189,10 +189,21 @@ def test_middling_programs_of_windows_are_solved_by_interior_points_alone(monkey
     assert alone.episode_circularity == pytest.approx(usual.episode_circularity, rel=0.005)
 
 
+@pytest.mark.parametrize("has_hipo", [True, False])
 def test_a_middling_program_leaves_its_basis_and_takes_a_plan_whose_multipliers_went_wrong(
-    monkeypatch: pytest.MonkeyPatch,
+    has_hipo: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of what need not be certified; a smaller program goes on from its basis, and is tried again."""
+    """Of what need not be certified; a smaller program goes on from its basis, and is tried again.
+
+    Without the package of HiPO, IPX is the only one that is tried.
+    """
+    attempts = [*solver.MIDDLING_SETTINGS]
+    if has_hipo:
+        pytest.importorskip("highspy_extras")
+    else:
+        monkeypatch.setattr(solver, "find_spec", lambda name: None)
+        attempts = [settings for settings in attempts if settings["solver"] != "hipo"]
+        assert attempts == [solver.SETTINGS[1]]
     tried, run = list[tuple[Any, Any]](), solver._ScaledProgram.run
     problem = bound("copper_net", min_service=0.9, degree=1, horizon=8).problem
     basis = solver.solve(problem).basis
@@ -219,14 +230,24 @@ def test_a_middling_program_leaves_its_basis_and_takes_a_plan_whose_multipliers_
     solver.solve(problem, basis, certify=False)
     assert tried[0] == (None, basis) and [options for options, _ in tried[1:]] == [*solver.SETTINGS]
     monkeypatch.setattr(solver, "BASIS_PROGRAM", 0)
-    tried.clear()
-    solver.solve(problem, basis, certify=False)
-    assert tried == [(solver.SETTINGS[1], None)]
+    for size, first in ((solver.HIPO_PROGRAM, solver.SETTINGS[1]), (0, attempts[0])):
+        monkeypatch.setattr(solver, "HIPO_PROGRAM", size)
+        tried.clear()
+        solver.solve(problem, basis, certify=False)
+        assert tried == [(first, None)]
+    # so does a large one, but where its multipliers are asked for
+    monkeypatch.setattr(solver, "LARGE_PROGRAM", 0)
+    for is_rough, every in ((False, solver.LARGE_SETTINGS), (True, (solver.ROUGH_SETTINGS, *solver.LARGE_SETTINGS))):
+        tried.clear()
+        solver.solve(problem, certify=False, is_rough=is_rough)
+        possible = [options for options in every if has_hipo or options["solver"] != "hipo"]
+        assert tried == [(options, None) for options in (possible if is_rough else possible[:1])]
+    monkeypatch.setattr(solver, "LARGE_PROGRAM", 10**9)
     tried.clear()  # what interior points do not solve is given up
     monkeypatch.setattr(solver._ScaledProgram, "is_feasible", lambda *_: False)
     with pytest.raises(solver.SolverFailure):
         solver.solve(problem, basis, certify=False)
-    assert tried == [(solver.SETTINGS[1], None)]
+    assert tried == [(settings, None) for settings in attempts]
 
 
 @pytest.mark.parametrize(("distance", "count"), [(0.5 * solver.FAIR, 3), (2.0 * solver.FAIR, 4)])
