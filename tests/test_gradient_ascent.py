@@ -10,14 +10,18 @@ import torch
 from small_networks import ONE_OF_EACH, booked
 
 from cirl_marl import MultiAgentVectorEnv, RecipeError, load_network, train
+from cirl_marl.controllers.rollout import rollout
 from cirl_marl.environments.derivatives import Derivatives
 from cirl_marl.errors import CirlError
 from cirl_marl.learners.interface import default_recipe, prepare
+from cirl_marl.learners.policies import Policies
 from cirl_marl.learners.recipe import LearnerSettings, Recipe, Run
 from cirl_marl.learners.stacked import gradient_ascent
 from cirl_marl.learners.stacked.gradient_ascent import GradientStack
 
 PARAMETERS = {"policy_kwargs": {"net_arch": [4]}, "max_grad_norm": 1e9, "n_steps": 4, "batch_size": 8}
+BUFFERED: dict[str, Any] = {"buffer_size": 8, "policy_kwargs": {"net_arch": [4], "activation_fn": torch.nn.Tanh}}
+SQUASHED = ("TD3", "DDPG", "SAC", "TQC")
 
 
 def recipe(run: dict[str, Any] | None = None, **learner: Any) -> Recipe:
@@ -34,9 +38,12 @@ def recipe(run: dict[str, Any] | None = None, **learner: Any) -> Recipe:
     )
 
 
-@pytest.mark.parametrize(("share", "budgets"), [(1.0, {}), (0.5, {"emissions": -50.0, "cost": 20.0})])
+@pytest.mark.parametrize(
+    ("share", "budgets", "algorithm"),
+    [(1.0, {}, "PPO"), (0.5, {"emissions": -50.0, "cost": 20.0}, "PPO"), *((1.0, {}, name) for name in SQUASHED)],
+)
 def test_gradients_go_through_the_policies(
-    monkeypatch: pytest.MonkeyPatch, share: float, budgets: dict[str, float]
+    monkeypatch: pytest.MonkeyPatch, share: float, budgets: dict[str, float], algorithm: str
 ) -> None:
     """They are those of the mean over copies of λ̄/c, levels and budgeted totals at their prices, by every weight.
 
@@ -90,9 +97,43 @@ def test_gradients_go_through_the_policies(
 
     monkeypatch.setattr(GradientStack, "_ascend", check)
     monkeypatch.setattr(gradient_ascent, "FEEDBACK", share)
+    monkeypatch.setattr(gradient_ascent, "LARGEST_NORM", 1e9)
     asked = {"steps": 8, "evaluations": 1, "at_most": budgets, "price_rate": 0.1}
-    train(booked(load_network("carbo_net"), 2, efforts=False), recipe(asked), charges={"cost": 30.0} if budgets else {})
+    climb = recipe(asked, algorithm=algorithm, parameters=PARAMETERS if algorithm == "PPO" else BUFFERED)
+    train(booked(load_network("carbo_net"), 2, efforts=False), climb, charges={"cost": 30.0} if budgets else {})
     assert len(checked) == 1 and checked[0] > 0
+
+
+@pytest.mark.parametrize("algorithm", SQUASHED)
+def test_actors_that_climbed_are_those_of_the_models(algorithm: str) -> None:
+    """Each model does what the stack does, its target as well; critics stay, and what is paid at its prices grows."""
+    parameters = BUFFERED | {"learning_rate": 0.03}
+    climb = recipe({"steps": 320, "price_rate": 0.0}, algorithm=algorithm, parameters=parameters)
+    fresh, found = prepare("copper_net", climb, seed=3), train("copper_net", climb, seed=3)
+    (stack,) = found._stacks
+    assert isinstance(stack, GradientStack)
+    rows = np.random.default_rng(0).normal(size=(len(found.learners), 5, stack._inputs.local))
+    for part, columns in zip(rows, stack._inputs.actor_columns, strict=True):
+        part[:, len(columns) :] = 0.0
+    outputs = stack._deterministic_actions(torch.as_tensor(rows, dtype=torch.float32)).numpy()
+    for name, part, output in zip(found.learners, rows, outputs, strict=True):
+        model: Any = found.learners[name].model
+        seen, entries = part[:, : model.observation_space.shape[0]].astype(np.float32), model.action_space.shape[0]
+        np.testing.assert_allclose(model.predict(seen, deterministic=True)[0], output[:, :entries], atol=1e-6)
+        if algorithm in ("TD3", "DDPG"):
+            states = model.actor.state_dict(), model.actor_target.state_dict()
+            assert all(torch.equal(value, states[1][key]) for key, value in states[0].items())
+        before: Any = fresh.learners[name].model
+        critics = zip(model.critic.parameters(), before.critic.parameters(), strict=True)
+        assert all(torch.equal(new, old) for new, old in critics)
+    paid = []
+    for training in (fresh, found):
+        env = MultiAgentVectorEnv("copper_net", num_envs=8, reward="team", circularity="mean", horizon=4)
+        run = rollout(env, Policies({key: learner.policy for key, learner in training.learners.items()}), seed=1)
+        prices = stack._prices
+        paid.append(run.episode_circularity.mean() / env.network.objective.circularity_scale)
+        paid[-1] += prices @ run.episode_levels.mean(axis=0)
+    assert paid[1] > paid[0] + 0.01
 
 
 def test_each_service_has_a_price(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -121,7 +162,26 @@ def test_each_service_has_a_price(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("changes", "options", "reason"),
     [
-        ({"algorithm": "A2C", "parameters": {}}, {}, "algorithm A2C: its policies are those of PPO"),
+        (
+            {"algorithm": "A2C", "parameters": {}},
+            {},
+            "algorithm A2C: its policies are those of PPO, TD3, DDPG, ",
+        ),
+        (
+            {"algorithm": "SAC", "parameters": {"use_sde": True}},
+            {},
+            "parameters.use_sde: what acts is no",
+        ),
+        (
+            {"algorithm": "TD3", "parameters": {"policy_kwargs": {"activation_fn": torch.nn.ELU}}},
+            {},
+            "parameters.policy_kwargs: activation ELU is not one of Tanh, ReLU",
+        ),
+        (
+            {"algorithm": "TQC", "parameters": {"policy_kwargs": {"optimizer_class": torch.optim.Adagrad}}},
+            {},
+            "parameters.policy_kwargs: optimiser Adagrad is not element by element",
+        ),
         ({"scheme": "joint"}, {}, "scheme joint: each agent has a policy of its own"),
         ({}, {"reward": "mixed"}, "reward 'mixed'"),
     ],

@@ -379,7 +379,7 @@ def test_critics_learn_what_the_state_is_like_after_a_recipe(recipe_first: Path,
 @pytest.mark.parametrize("engine", ["lockstep", "stacked"])
 def test_critics_of_a_run_keep_what_they_know_of_the_state(tmp_path: Path, engine: str) -> None:
     """They come with the policy, and so do the statistics by which they see."""
-    central = {"policy": "CentralCriticPolicy"}
+    central: dict[str, Any] = {"policy": "CentralCriticPolicy"}
     source = train("copper_net", recipe(**central), directory=tmp_path / "first", **OPTIONS)
     found = train("copper_net", recipe(**central, **from_run(tmp_path / "first")), engine=engine, **OPTIONS)
     for name in AGENTS:

@@ -240,7 +240,7 @@ class Run(Settings):
         "auto",
         description="lockstep: each learner's own learn(), unmodified; stacked: learners of the same settings as one, "
         "the same algorithm up to rounding and several times as fast; auto: stacks those that can be; gradients: "
-        "policies of PPO by exact gradients of the simulator instead of the algorithm",
+        "policies of PPO, TD3, DDPG, SAC or TQC by exact gradients of the simulator instead of the algorithm",
     )
     evaluations: Annotated[int, Field(strict=True, ge=0)] = Field(
         20, description="evaluations during a run, the best of which is the checkpoint that counts; 0: the last one"

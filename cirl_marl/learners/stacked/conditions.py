@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import torch
-from sb3_contrib import ARS
+from sb3_contrib import ARS, TQC
 from sb3_contrib.ars.policies import ARSPolicy
-from stable_baselines3 import A2C, PPO
+from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -19,12 +21,14 @@ from cirl_marl.learners.policies import CentralCriticPolicy
 from cirl_marl.learners.recipe import LearnerSettings, Run
 from cirl_marl.learners.stacked.gradient_ascent import GradientStack
 from cirl_marl.learners.stacked.on_policy import RolloutStack
-from cirl_marl.learners.stacked.perceptrons import ACTIVATIONS, linear_layers
+from cirl_marl.learners.stacked.perceptrons import ACTIVATIONS, linear_layers, networks_of
 from cirl_marl.learners.stacked.search import SearchStack, copies_per_candidate, parts_of
 from cirl_marl.learners.stacked.stack import Stack
 
 OPTIMISERS = (torch.optim.Adam, torch.optim.AdamW, torch.optim.RMSprop, torch.optim.SGD, RMSpropTFLike)
 """Optimisers that work element by element, so that zeros stay zero."""
+SQUASHED = (TD3, DDPG, SAC, TQC)
+"""Off-policy algorithms whose actors are perceptrons with bounded outputs."""
 EXTRACTORS = {ActorCriticPolicy: FlattenExtractor, CentralCriticPolicy: CombinedExtractor}
 
 
@@ -35,9 +39,14 @@ def gradient_stacks(trainings: Iterable[Iterable[Learner]], device: str, run: Ru
 
 def gradient_obstacle(learner: Learner, settings: LearnerSettings) -> str | None:
     """Return why exact gradients cannot move a learner as they do one of ``settings``; None if they can."""
-    if type(learner.model) is not PPO:
-        return f"algorithm {learner.spec.algorithm}: its policies are those of PPO"
-    reason = _on_policy_obstacle(learner.model, learner.spec.policy)
+    model = learner.model
+    if type(model) is PPO:
+        reason = _on_policy_obstacle(model, learner.spec.policy)
+    elif type(model) in SQUASHED:
+        reason = _actor_obstacle(model)
+    else:
+        names = ", ".join(kind.__name__ for kind in (PPO, *SQUASHED))
+        reason = f"algorithm {learner.spec.algorithm}: its policies are those of {names}"
     alike = {"kind", "role", "agents"}
     if reason is not None:
         return reason
@@ -99,6 +108,24 @@ def _on_policy_obstacle(model: PPO | A2C, policy_name: str) -> str | None:
     if len(kinds - {None}) > 1 or not kinds <= {None, *ACTIVATIONS}:
         names = " or ".join(activation.__name__ for activation in ACTIVATIONS)
         return f"parameters.policy_kwargs: hidden layers are not linear with {names} between them"
+    return None
+
+
+def _actor_obstacle(model: BaseAlgorithm) -> str | None:
+    """Return why exact gradients cannot move the actor of an off-policy algorithm; None if they can."""
+    policy: Any = model.policy
+    if getattr(model, "use_sde", False):
+        return "parameters.use_sde: what acts is no perceptron with it"
+    if type(policy.actor.features_extractor) is not FlattenExtractor:
+        return f"features by {type(policy.actor.features_extractor).__name__}: only multilayer perceptrons are moved"
+    if type(policy.actor.optimizer) not in OPTIMISERS:
+        return f"parameters.policy_kwargs: optimiser {type(policy.actor.optimizer).__name__} is not element by element"
+    try:
+        activation = networks_of(policy).activation
+    except TypeError as error:
+        return f"parameters.policy_kwargs: {error}"
+    if activation is not None and activation not in ACTIVATIONS:
+        return f"parameters.policy_kwargs: activation {activation.__name__} is not one of Tanh, ReLU"
     return None
 
 

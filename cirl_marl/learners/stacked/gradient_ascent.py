@@ -43,12 +43,14 @@ round the network it would grow from interval to interval without bound. Where e
 action is worth is zero, and so is what is left out."""
 MARGIN = 0.05
 """Least margin of a service, in parts of what may lack: where nothing is random its level swings about the demand."""
+LARGEST_NORM = 0.2
+"""Norm to which gradients are clipped where the algorithm has no ``max_grad_norm``."""
 LEAST_PRICE = 1e-4
 """Below which no price falls, per circularity scale."""
 
 
 class GradientStack(Stack):
-    """All agents of one environment, whose policies are those of PPO; their critics and deviations stay as they are."""
+    """All agents of one environment; critics and deviations of their policies stay as they are."""
 
     def __init__(self, members: Sequence[Learner], device: str, run: Run) -> None:
         """Take over parameters, optimisers and counters of the learners; ``run`` says what is asked of services."""
@@ -103,6 +105,8 @@ class GradientStack(Stack):
         self._weights.give()
         for model in self._models:
             model.num_timesteps, model._n_updates = self._timesteps, self._updates
+            if (target := getattr(model, "actor_target", None)) is not None:
+                target.load_state_dict(model.actor.state_dict())
 
     def _play(self) -> None:
         """Play an episode in every copy, and keep what the way back needs."""
@@ -154,7 +158,7 @@ class GradientStack(Stack):
         write_gradients(weights.actor, [values for _, values, _ in self._tape], gradients)
         rate = self._models[0].lr_schedule(progress_remaining)
         update_learning_rate(weights.optimiser, rate)
-        weights.clip(self._models[0].max_grad_norm)
+        weights.clip(getattr(self._models[0], "max_grad_norm", LARGEST_NORM))
         weights.optimiser.step()
         self._updates += 1
         levels = after.service / length

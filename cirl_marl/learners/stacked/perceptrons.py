@@ -9,7 +9,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3.common.policies import ActorCriticPolicy
+from sb3_contrib.tqc.policies import Actor as QuantileActor
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.sac.policies import Actor as SquashedActor
+from stable_baselines3.td3.policies import Actor as DeterministicActor
 from torch import Tensor, nn
 
 from cirl_marl.network import Integers
@@ -69,11 +72,15 @@ class Layer:
 
 @dataclass(frozen=True, slots=True)
 class Perceptrons:
-    """N perceptrons, each ``x ↦ W_L a(… a(W_1 x + b_1) …) + b_L``, and where their gradients go, if they have any."""
+    """N perceptrons, each ``x ↦ W_L a(… a(W_1 x + b_1) …) + b_L``, and where their gradients go, if they have any.
+
+    ``squash`` follows, where the outputs are bounded.
+    """
 
     layers: Sequence[Layer]
     activation: Activation
     gradients: Sequence[Layer] = ()
+    squash: Activation | None = None
 
     @property
     def width(self) -> int:
@@ -87,10 +94,17 @@ class Perceptrons:
             values.append(layer[members].of(values[-1]))
             if layer is not self.layers[-1]:
                 self.activation.value(values[-1])
+            elif self.squash is not None:
+                self.squash.value(values[-1])
         return values
+
+    def before_squash(self, values: Sequence[Tensor], gradient: Tensor) -> Tensor:
+        """Return the gradient of what is squashed, from that of the outputs."""
+        return gradient if self.squash is None else self.squash.gradient(gradient, values[-1])
 
     def backward(self, values: Sequence[Tensor], gradient: Tensor, members: slice = slice(None)) -> None:
         """Write the gradients of weights and biases, from what ``forward`` gave and the gradient of the outputs."""
+        gradient = self.before_squash(values, gradient)
         for place in reversed(range(len(self.layers))):
             into = self.gradients[place][members]
             _multiply(gradient.mT, values[place], into.weight)
@@ -103,7 +117,7 @@ class Perceptrons:
 
 def chain(perceptrons: Perceptrons, values: Sequence[Tensor], gradient: Tensor) -> list[Tensor]:
     """Return the gradients of the inputs and of each layer's sums, shape (learners, samples, …), from the outputs'."""
-    gradients = [gradient]
+    gradients = [perceptrons.before_squash(values, gradient)]
     for place in reversed(range(len(perceptrons.layers))):
         before = torch.bmm(gradients[0], perceptrons.layers[place].weight)
         gradients.insert(0, perceptrons.activation.gradient(before, values[place]) if place else before)
@@ -203,6 +217,41 @@ def layers_of(fields: Sequence[tuple[Field, Field | None]], matrix: Tensor) -> l
     return [Layer(weight.of(matrix), None if bias is None else bias.of(matrix)) for weight, bias in fields]
 
 
+@dataclass(frozen=True, slots=True)
+class Networks:
+    """The perceptrons of a policy, and what moves them."""
+
+    optimiser: torch.optim.Optimizer
+    actor: Sequence[nn.Module]
+    activation: type[nn.Module] | None
+    squash: Activation | None = None
+    critic: Sequence[nn.Module] = ()
+    log_std: Tensor | None = None
+
+
+def networks_of(policy: BasePolicy) -> Networks:
+    """Return the networks of a policy; critics of off-policy algorithms, which judge actions, are left out.
+
+    Raises:
+        TypeError: if it is none of multilayer perceptrons.
+    """
+    squash = ACTIVATIONS[nn.Tanh]
+    if isinstance(policy, ActorCriticPolicy):
+        actor, activation = linear_layers(policy.mlp_extractor.policy_net)
+        critic, _ = linear_layers(policy.mlp_extractor.value_net)
+        layers = [*actor, policy.action_net], activation, None, [*critic, policy.value_net]
+        return Networks(policy.optimizer, *layers, policy.log_std)
+    owner: Any = getattr(policy, "actor", None)
+    if isinstance(owner, DeterministicActor):
+        *body, last, _ = owner.mu.children()
+    elif isinstance(owner, SquashedActor | QuantileActor):
+        body, last = [*owner.latent_pi.children()], owner.mu
+    else:
+        raise TypeError(f"policy {type(policy).__name__} has no actor that is a multilayer perceptron")
+    linear, activation = linear_layers(nn.Sequential(*body))
+    return Networks(owner.optimizer, [*linear, last], activation, squash)
+
+
 class Weights:
     """Standard deviations, actors and critics of N policies.
 
@@ -212,6 +261,7 @@ class Weights:
         matrix: parameters of all learners, shape (learners, parameters).
         gradient: of the same shape.
         log_std: logarithm of the standard deviation of each action, shape (learners, actions); a view of the matrix.
+            Policies of off-policy algorithms have none, and no critic here.
         log_std_gradient: its part of the gradient.
         actor: from what an agent sees to the mean of its action.
         critic: from what a critic sees to the value of the state.
@@ -220,7 +270,7 @@ class Weights:
 
     def __init__(
         self,
-        policies: Sequence[ActorCriticPolicy],
+        policies: Sequence[BasePolicy],
         actor_columns: Sequence[Integers],
         critic_columns: Sequence[Integers],
         device: torch.device,
@@ -230,23 +280,25 @@ class Weights:
         ``actor_columns`` and ``critic_columns`` are, by learner, the columns of the padded inputs at which its actor
         and its critic look.
         """
-        self._policies, self._layout = policies, (layout := ParameterLayout(len(policies)))
-        log_std = layout.field([p.log_std for p in policies], [np.arange(len(p.log_std)) for p in policies])
-        actors = [[*linear_layers(p.mlp_extractor.policy_net)[0], p.action_net] for p in policies]
-        critics = [[*linear_layers(p.mlp_extractor.value_net)[0], p.value_net] for p in policies]
-        actor, critic = layout.layers(actors, actor_columns), layout.layers(critics, critic_columns)
+        self._networks = [networks_of(policy) for policy in policies]
+        self._layout = layout = ParameterLayout(len(policies))
+        networks, kind = self._networks, self._networks[0]
+        deviations = [part.log_std for part in networks if part.log_std is not None]
+        log_std = layout.field(deviations, [np.arange(len(part)) for part in deviations]) if deviations else None
+        actor = layout.layers([part.actor for part in networks], actor_columns)
+        critic = layout.layers([part.critic for part in networks], critic_columns)
         self.matrix = nn.Parameter(torch.zeros(len(policies), layout.columns, device=device), requires_grad=False)
         self.gradient = torch.zeros_like(self.matrix)
         self.matrix.grad = self.gradient
-        first = policies[0]
-        kind: Any = first.optimizer_class
-        rate = first.optimizer.param_groups[0]["lr"]
-        self.optimiser: torch.optim.Optimizer = kind([self.matrix], lr=rate, **first.optimizer_kwargs)
-        self.log_std, self.log_std_gradient = log_std.of(self.matrix), log_std.of(self.gradient)
-        activation = ACTIVATIONS[linear_layers(policies[0].mlp_extractor.policy_net)[1] or nn.Tanh]
+        optimiser: Any = policies[0].optimizer_class
+        rate = kind.optimiser.param_groups[0]["lr"]
+        self.optimiser: torch.optim.Optimizer = optimiser([self.matrix], lr=rate, **policies[0].optimizer_kwargs)
+        if log_std is not None:
+            self.log_std, self.log_std_gradient = log_std.of(self.matrix), log_std.of(self.gradient)
+        activation = ACTIVATIONS[kind.activation or nn.Tanh]
         self.actor, self.critic = (
-            Perceptrons(layers_of(fields, self.matrix), activation, layers_of(fields, self.gradient))
-            for fields in (actor, critic)
+            Perceptrons(layers_of(fields, self.matrix), activation, layers_of(fields, self.gradient), squash)
+            for fields, squash in ((actor, kind.squash), (critic, None))
         )
         self._take()
 
@@ -259,12 +311,12 @@ class Weights:
         """Give each policy its parameters, and its optimiser its state."""
         optimiser_state = self.optimiser.state.get(self.matrix, {})
         rate = self.optimiser.param_groups[0]["lr"]
-        for learner, policy in enumerate(self._policies):
-            policy.optimizer.param_groups[0]["lr"] = rate
+        for learner, networks in enumerate(self._networks):
+            networks.optimiser.param_groups[0]["lr"] = rate
             for parameter, columns in self._layout.places(learner):
                 with torch.no_grad():
                     parameter.copy_(self.matrix[learner, columns].view(parameter.shape))
-                policy.optimizer.state[parameter] = {
+                networks.optimiser.state[parameter] = {
                     name: value[learner, columns].view(parameter.shape).to(parameter.device)
                     if _is_like(value, self.matrix)
                     else _copy(value)
@@ -273,10 +325,10 @@ class Weights:
 
     def _take(self) -> None:
         state: dict[str, Any] = {}
-        for learner, policy in enumerate(self._policies):
+        for learner, networks in enumerate(self._networks):
             for parameter, columns in self._layout.places(learner):
                 self.matrix[learner, columns] = parameter.detach().flatten().to(self.matrix.device)
-                for name, value in policy.optimizer.state.get(parameter, {}).items():
+                for name, value in networks.optimiser.state.get(parameter, {}).items():
                     if not _is_like(value, parameter):
                         state[name] = _copy(value)  # a number of steps: the same for all, who learn together
                         continue
