@@ -73,6 +73,7 @@ RECIPES = (
     "independent_ars",
     "independent_ppo",
     "central_critic_ppo",
+    "guided_ppo",
     "shared_ppo",
     "mappo",
     "joint_ppo",
@@ -108,7 +109,7 @@ class Job:
         if not all(_note(run).is_file() for run in self.runs):
             return False
         now = prepare(self.network, self.recipe, seed=self.seeds[0], **dict(self.options))
-        kept = {"seed", "definition_sha256", "data_sha256", "region"}  # the network is compared itself
+        kept = {"seed", "definition_sha256", "data_sha256", "region", "origins"}  # the network is compared itself
         wanted = now.config.model_dump(exclude=kept)
         return all(
             run.config.model_dump(exclude=kept) == wanted and run.network() == load_network(self.network)
