@@ -34,6 +34,7 @@ from cirl_marl.controllers.lint import lint_warnings
 from cirl_marl.controllers.outcome import service_shortages
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.definitions.reader import write_network
+from cirl_marl.dynamics import supply
 from cirl_marl.network import Network
 from cirl_marl.network.elements import Lifetime
 from cirl_marl.optimum import bound, improve_plan, simulate_plan
@@ -337,7 +338,7 @@ def test_what_lacks_is_found_past_bends() -> None:
 
 @pytest.mark.medium
 def test_supplies_cost_few_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two estimates, by two and by five terms, and the interval itself are the usual year of steel in Japan."""
+    """Two estimates, by two and by eight terms, and the interval itself are the usual year of steel in Japan."""
     env = MultiAgentVectorEnv("steel_japan", num_envs=2)
     advance, estimate, terms = env.dynamics.advance, env.dynamics.estimate, list[int]()
 
@@ -396,6 +397,23 @@ def test_few_terms_leave_what_their_flows_leave(terms: int) -> None:
     env = MultiAgentVectorEnv(with_substances(random_network(8080, 6, 14), 8080), num_envs=3)
     env.reset(seed=8080)
     assert estimate(env, terms, flows=False)[0].min() >= 0.0
+
+
+@pytest.mark.parametrize("name", ["steel_japan", pytest.param("steel_world", marks=pytest.mark.slow)])
+def test_estimates_leave_flows_within_1e_9(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of those of supplies that are corrected in full until nothing lacks to thirteen digits."""
+    env = MultiAgentVectorEnv(name, num_envs=2)
+    years = [np.random.default_rng(year).uniform(-1, 1, (len(env.agents), 2)) for year in range(5)]
+
+    def flows() -> Floats:
+        env.reset(seed=0)
+        return np.array([env.advance(actions).flow.copy() for actions in years])
+
+    estimated = flows()
+    monkeypatch.setattr(supply, "CLOSE", 1e-13)
+    monkeypatch.setattr(supply, "LEVELS", supply.LEVELS[-1:])
+    exact = flows()
+    np.testing.assert_allclose(estimated, exact, rtol=0, atol=1e-9 * exact.max())
 
 
 def reserve(stock: float, most: float, demand: float = 47.0, export: float = 0.0) -> Network:

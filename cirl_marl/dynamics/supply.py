@@ -33,15 +33,15 @@ from cirl_marl.network import Floats, Integers, RowSum
 from cirl_marl.network.compartment_model import Bools
 from cirl_marl.network.uncertainty import numbers_of
 
-CLOSE = 3e-10
+CLOSE = 1e-10
 """Distance of what is measured from what is demanded, relative to that, at which nothing lacks."""
 ROUNDS, FACTOR_ROUNDS = 24, 4
 """Most corrections, and those after which A is changed as a whole where factors have not led there."""
 SECANTS, DIFFERENCE = 6, 1e-4
 """Corrections by secants after which A is measured anew, and the part of the most by which it then shifts supplies."""
-LEVELS = ((2, 2e-2, 2), (6, 2e-5, 5), (None, 0.0, ROUNDS + 1))
-"""Terms of the solver's series by which intervals are estimated; part of the demand below which what lacks will be
-little after one more correction; and most of these intervals. The last ones are simulated in full."""
+LEVELS = ((2, 4e-4, 2), (8, 3e-9, 5), (None, 0.0, ROUNDS + 1))
+"""Terms of the solver's series by which intervals are estimated; part of the demand that may lack after one more
+correction, if that does as well as the last one; and most of these intervals. The last ones are simulated in full."""
 NOTABLE = 1e-6
 """Part of a demand that, if it lacks though it could be had, is told in a warning."""
 CELLS = 80_000
@@ -193,6 +193,7 @@ class Supply:
         unit_rate = dynamics.rate(all_controls, step, factors)
         routes = dynamics.routing.routes(dynamics.orders.further_shares(unit_rate))
         arrivals = self.arrivals(routes)
+        lack = np.ones(batch)
         for terms, accuracy, rounds in LEVELS if dynamics.taylor is not None and not dynamics.orders else LEVELS[-1:]:
             open_ = np.ones(batch, dtype=bool)
             for correction in range(rounds):
@@ -230,7 +231,10 @@ class Supply:
                 supply[:, wrong] = complementary(slope[wrong], short, now, most, self._interval)
                 change = supply - before
                 expected = np.where(is_wrong, (slope * np.ascontiguousarray(change.T)[:, None]).sum(axis=2).T, expected)
-                open_ = is_wrong & (gap > accuracy * demand).any(axis=0) & (change != 0.0).any(axis=0)
+                earlier_lack = lack
+                lack = np.divide(gap, demand, out=np.zeros_like(gap), where=demand > 0).max(axis=0)
+                may_lack = terms is None or lack * lack > accuracy * earlier_lack
+                open_ = is_wrong & may_lack & (change != 0.0).any(axis=0)
                 if not open_.any():
                     break
         assert done is not None
