@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.linalg import expm
+from scipy.special import gammainc
 from test_lifetimes import INFLOW, LIVES, town
 
 from benchmarks.products import product_cycle
@@ -16,14 +17,16 @@ from benchmarks.yearly import LIFETIMES, yearly_network
 from cirl_marl import Control, ControlKind, MultiAgentVectorEnv, Series, Service
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import rollout
-from cirl_marl.network.elements import Lifetime
+from cirl_marl.network.elements import CIRCULARITY, Lifetime
 from cirl_marl.network.lifetimes import chain_of
 from cirl_marl.optimum import bound, envelope, improve_plan, simulate_plan
 from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.bounds import tight_bound
 from cirl_marl.optimum.kernels import Kernel
 from cirl_marl.optimum.mpc import MPC
 from cirl_marl.optimum.options import by_stage
 from cirl_marl.optimum.program import Programs
+from cirl_marl.optimum.vintages import Lifetimes
 
 Floats = NDArray[np.floating]
 FINE = 300
@@ -77,9 +80,10 @@ def test_rows_and_boxes_hold_in_an_episode(lifetime: Lifetime, stretch: float | 
     years = 4
     network = town(lifetime, INFLOW[:years], initial=30.0, growth=0.02, stretch=stretch)
     programs = Programs(Admissible.of(network), 2, None)
-    lifetimes, layout = programs.admissible.lifetimes, programs.layout
+    lifetimes = programs.admissible.lifetimes
+    layout = programs.layout.with_constant_parts(np.empty(0, dtype=np.intp), lifetimes.exit_arcs)
     start = by_stage(network, lifetimes.state_layout, network.initial[1])
-    problem = programs.program(start)
+    high = programs.program(start).high.reshape(years, -1)
     matrix, to = lifetimes.rows(layout, start, range(years))
     steps = layout.pieces * FINE
     short = network.with_options(episode={"control_interval": 1.0 / steps, "horizon": years * steps})
@@ -90,11 +94,11 @@ def test_rows_and_boxes_hold_in_an_episode(lifetime: Lifetime, stretch: float | 
     for i, moment in enumerate(layout.moments):
         values[:, layout.flow[moment] + each.exit_arc] = left[:, i]
         values[:, layout.flow[moment] + each.inflow_arcs[0]] = INFLOW[:years]
-        columns = layout.size * np.arange(years) + layout.flow[moment] + each.exit_arc
-        assert (left[:, i] <= problem.high[columns] * (1 + 1e-6)).all()
+        assert (left[:, i] <= high[:, layout.flow[moment] + each.exit_arc] * (1 + 1e-6)).all()
+    values[:, layout.steady_column(each.exit_arc)] = left.min(axis=1)
     assert (matrix @ values.ravel() <= to + 1e-5 * left.max()).all()
-    # and they leave little room
-    room = (to - matrix @ values.ravel()).max()
+    # and those before the rows of constant parts leave little room
+    room = (to - matrix @ values.ravel())[:-years].max()
     assert room < 1e-2 * left.max()
 
 
@@ -166,13 +170,44 @@ def test_no_episode_of_a_generated_cycle_exceeds_its_bound(seed: int) -> None:
         ).circularity_mean
     circularity, levels = circularity / network.episode.horizon, env.physical.service.T / network.episode.horizon
     for copy in (circularity.argmax(), levels.sum(axis=1).argmax()):
-        found = bound(network, min_service=levels[copy] * (1 - 1e-6), degree=1)
+        demand = levels[copy] * (1 - 1e-6)
+        found = bound(network, min_service=demand, degree=1)
+        tight = tight_bound(network, min_service=demand, aim=CIRCULARITY)
+        assert circularity[copy] <= tight.objective + 1e-9 * abs(tight.objective)
         assert found.verify().bound == found.objective
         same = (levels >= levels[copy]).all(axis=1)
         assert circularity[same].max() <= found.objective + 1e-9 * abs(found.objective)
         run = simulate_plan(found)
         if (run.episode_levels[0] >= levels[copy]).all():
             assert run.episode_circularity[0] <= found.objective + 1e-9 * abs(found.objective)
+
+
+@pytest.mark.sample(2)
+@pytest.mark.parametrize("lifetime", [Lifetime(mean=20.0, deviation=6.0, distribution="normal"), LIVES[0]])
+def test_constant_parts_of_lifetimes_are_nearly_all_that_leaves(lifetime: Lifetime) -> None:
+    """Of an even inflow into a stock in balance: but for what leaves in the year in which it enters, and what rises.
+
+    Of a cohort the least of a year counts: in all half the total variation of the density of ages, about 1/(σ·√2π).
+    """
+    years = 30
+    network = town(lifetime, np.full(years, 10.0), initial=10.0 * lifetime.mean, growth=0.0)
+    lifetimes = Lifetimes(network, ())
+    layout = Programs(Admissible.of(network), 2, None).layout
+    layout = layout.with_constant_parts(np.empty(0, dtype=np.intp), lifetimes.exit_arcs)
+    start = by_stage(network, lifetimes.state_layout, network.initial[1])
+    matrix, to = lifetimes.rows(layout, start, range(years))
+    whole, values = lifetimes.whole[0], np.zeros((years, layout.size))
+    values[:, layout.flow + whole.inflow_arcs[0]] = 10.0
+    rows = matrix.tocsc()[:, layout.size * np.arange(years) + layout.steady_column(whole.exit_arc)].nonzero()[0]
+    least = (matrix @ values.ravel() - to)[rows]
+    assert len(rows) == years and (np.diff(rows) == 1).all()
+    chain, turnover = whole.chain, whole.chain.rate / lifetime.mean
+    in_a_year = chain.weights[0] + sum(w * gammainc(n, turnover) for n, w in enumerate(chain.weights[1:], 1))
+    run = rollout(MultiAgentVectorEnv(network, num_envs=1), Neutral())
+    left = run.flow[:, network.arc_index["discard"]]
+    assert (least <= left).all() and (
+        left - least <= 10.0 * (in_a_year + 0.8 / (lifetime.deviation * np.sqrt(2 * np.pi)))
+    ).all()
 
 
 @pytest.mark.slow

@@ -184,9 +184,12 @@ def variables(layout: Layout, happened: Sequence[Interval]) -> Floats:
             found.append(merged[-1].end)
             if layout.has_end_flows:
                 found += [merged[-1].end_flow @ entering, merged[-1].end_flow]
-        first_flow = means(each.pieces[:together], layout.degree)[1][0]
+        parts = [each.pieces[first : first + together] for first in range(0, len(each.pieces), together)]
+        flow = np.concatenate([means(part, layout.degree)[1] for part in parts])
         refilled = np.isin(network.donors, network.recipients) & (len(each.pieces) > 1)
-        found += constant_parts(layout, each.controls, step, np.where(refilled, 0.0, first_flow))
+        in_part = np.isin(np.arange(len(network.arcs)), layout.steady_arcs)
+        steady = np.where(refilled, np.where(in_part, flow.min(axis=0), 0.0), flow[0])
+        found += constant_parts(layout, each.controls, step, steady)
         found += [each.levels, np.array([imbalance(network, each.flow)]), valve[layout.free_valves]]
     return np.concatenate(found)
 
@@ -204,7 +207,8 @@ def constant_parts(layout: Layout, controls: Controls, step: int, flow: Floats) 
     entering[:stores] = 0.0
     constant = np.linalg.solve(np.eye(nodes) - handed_on, entering)
     arcs = layout.steady_arcs
-    return [constant[layout.steady_nodes], shares[arcs] * constant[network.donors[arcs]]]
+    handed = np.where(network.donors[arcs] >= stores, shares[arcs] * constant[network.donors[arcs]], flow[arcs])
+    return [constant[layout.steady_nodes], handed]
 
 
 def assert_satisfies(problem: Program, v: Floats, mass: float) -> None:
@@ -230,8 +234,15 @@ def assert_holds(played: Played, degree: int, weight: float | None = None, merge
     Raises:
         NoCertificate: if recipients may empty their donors from the start.
     """
+    for steady_parts in (False, True):
+        admissible = Admissible.of(played.network, played.agents or None)
+        programs = Programs(admissible, degree, weight, merge_pieces=merged, steady_parts=steady_parts)
+        assert_rows_hold(played, programs, weight)
+
+
+def assert_rows_hold(played: Played, programs: Programs, weight: float | None) -> None:
+    """Do what ``assert_holds`` does, for one way to write the rows."""
     network, steps = played.network, played.network.episode.horizon
-    programs = Programs(Admissible.of(network, played.agents or None), degree, weight, merge_pieces=merged)
     layout, mass = programs.layout, float(played.start.sum())
     if len(played.intervals[0].pieces) % layout.pieces:
         return  # the oracle's means are over whole substeps
@@ -622,7 +633,8 @@ def test_shares_of_what_a_hoard_has_left(past: str, refilled: bool, merged: bool
             assert_holds(play(network, np.random.default_rng(seed), style), degree, None, merged)
 
 
-def test_shares_are_the_same_all_year() -> None:
+@pytest.mark.parametrize("refilled", [False, True])
+def test_shares_are_the_same_all_year(refilled: bool) -> None:
     """A market cannot give one product what comes early and another what comes late.
 
     Each has a life of a year; the level of one is what it gets, of the other what it has at the end. With a share s of
@@ -635,11 +647,12 @@ def test_shares_are_the_same_all_year() -> None:
             Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR, initial=(100.0, 100.0)),
             Node(id="early", initial=(0.0, 0.0)),
             Node(id="late", initial=(0.0, 0.0)),
-            Node(id="tip", role=Role.LANDFILL),
+            Node(id="tip", role=Role.LANDFILL, initial=(1.0, 1.0)),
             Node(id="sale", stores=False),
         ),
         arcs=(
             Arc(id="mining", donor="mine", recipient="sale", law=Law.EXOGENOUS, flow=1.0),
+            *([Arc(id="again", donor="tip", recipient="mine", rate=0.1)] if refilled else []),
             Arc(id="to_early", donor="sale", recipient="early", law=Law.SHARE, control=share),
             Arc(id="to_late", donor="sale", recipient="late", law=Law.SHARE),
             Arc(id="early_end", donor="early", recipient="tip", rate=1.0),
@@ -649,12 +662,12 @@ def test_shares_are_the_same_all_year() -> None:
             Service(id="sold", provider="to_early", quantity="flow", low=1.0),
             Service(id="held", provider="late", quantity="stock", low=-math.expm1(-1.0)),
         ),
-        episode=Episode(control_interval=1.0, horizon=1),
+        episode=Episode(control_interval=1.0, horizon=1, solver_step=0.5 if refilled else None),
         objective=Objective(circularity_scale=1.0),
     )
     most = []
     for constant_shares in (True, False):
-        programs = Programs(Admissible.of(network), 3, None, constant_shares=constant_shares)
+        programs = Programs(Admissible.of(network), 3, None, constant_shares=constant_shares, steady_parts=refilled)
         problem = programs.program(network.initial[1])
         cost = np.zeros_like(problem.cost)
         cost[problem.layout.level : problem.layout.imbalance] = -1.0

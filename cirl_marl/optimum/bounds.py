@@ -280,6 +280,16 @@ def bound(
     return _solve_bound(Programs(admissible, degree, service_weight), start, service_weight, levels, basis, aims)
 
 
+def tight_bound(
+    network: Network, *, min_service: ArrayLike, aim: Aim, at_most: Mapping[str, float] | None = None
+) -> Bound:
+    """Return ``bound`` by a program in which flows that may vary have constant parts: tighter, and slower."""
+    admissible = Admissible.of(network)
+    levels, aims = demanded_levels(network, min_service), aims_of(network, aim, at_most)
+    programs = Programs(admissible, DEGREE, None, steady_parts=True)
+    return _solve_bound(programs, starting_stocks(admissible.lifetimes, None), None, levels, None, aims)
+
+
 def envelope(
     network: str | Path | Network,
     initial: ArrayLike,

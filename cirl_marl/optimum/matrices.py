@@ -73,7 +73,7 @@ class Layout:
         end_flow: first of the flows at the end of each piece, which stand behind the throughputs, likewise.
         last: the stocks at the end of the interval.
         steady_nodes: nodes without stock of whose throughput the constant part A is a variable.
-        steady_arcs: their outflows, of whose flow the constant part a is one too.
+        steady_arcs: their outflows, and sources that are constant in part, of whose flow that part a is one too.
         steady: first of A, which a follows.
         level: first of the service levels.
         imbalance: the variable that is at least |Δ·σ_env·f̄|; counted only with ``net_zero = "abs"``.
@@ -134,6 +134,11 @@ class Layout:
         layout = copy(self)
         layout._lay_out_interval(nodes, arcs)
         return layout
+
+    def steady_column(self, arcs: ArrayLike) -> Integers:
+        """Return the column of a of some of ``steady_arcs``."""
+        column: Integers = self.steady + len(self.steady_nodes) + np.searchsorted(self.steady_arcs, arcs)
+        return column
 
     @property
     def key(self) -> Hashable:

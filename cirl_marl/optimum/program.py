@@ -98,6 +98,7 @@ class Programs:
         merge_pieces: bool | None = None,
         large: int | None = None,
         constant_shares: bool = True,
+        steady_parts: bool = False,
         system: ComparisonSystem | None = None,
         intervals: range | None = None,
         layout: Layout | None = None,
@@ -116,6 +117,7 @@ class Programs:
             large: variables beyond which it is; None: ``LARGE``.
             constant_shares: whether shares of what passes nodes without stock are constant within an interval, unless
                 controls are held, the program is large or its layout is given.
+            steady_parts: whether what is constant of flows that may vary has variables for these: tighter, and slower.
             system: of a program of the same network and agents, whatever their services demand.
             intervals: that programs will be of; None: of all.
             layout: of another program of the network, whatever its numbers; None: what its own ask for.
@@ -135,10 +137,11 @@ class Programs:
         excesses = len(self._ledger.excesses)
         self.layout = layout = layout or _layout(admissible, system.substeps, merge_pieces, degree, large, excesses)
         if constant_shares and layout.size * len(admissible.kinds) <= LARGE:
-            transit = Transit(admissible, system.substeps)
+            transit = Transit(admissible, system.substeps, steady_parts=steady_parts)
             if len(transit.splits):
-                self._transit, layout = transit, layout.with_constant_parts(transit.nodes, transit.arcs)
-                self.layout = layout
+                arcs = np.union1d(transit.arcs, transit.partly_steady)
+                self._transit, self.layout = transit, layout.with_constant_parts(transit.nodes, arcs)
+                layout = self.layout
         needs_own = has_lifetimes and (layout.has_end_flows or self._transit is not None)
         own_system = ComparisonSystem(admissible, cache) if needs_own else system
         self._equal, self._under = ChainedRows(layout), ChainedRows(layout)

@@ -9,6 +9,10 @@ are sums of stocks with constant factors. Where the stocks that B follows from f
 and their means under the test polynomials rise with i when divided by those of e^{−κt} (theorem 2). Past fast stocks,
 what these held at the start of the interval is allowed for (theorem 3). What may fall otherwise is allowed for as it
 flows: by schedule from a stock that is refilled, out of lifetimes with fast stages, or through lifetimes at once.
+
+Of such flows, and of all that leaves lifetimes that nobody stretches, A may have a part a_k too, at most what flows at
+any time of the interval (``partly_steady``). An order from a refilled stock is all of it, unless it may be cut; out of
+a lifetime comes at least what follows from all that entered in earlier intervals.
 """
 
 from __future__ import annotations
@@ -54,14 +58,18 @@ class Transit:
         constant: arcs whose flow is constant in an interval, unless a donor without inflow runs dry, shape (arcs,).
         nodes: nodes through which something constant comes to a split, and splits.
         arcs: their outflows.
+        partly_steady: arcs of whose flow a part is constant, if that is asked for.
         lives: nodes with a lifetime that is spread.
         varying_flow: arcs whose flows may fall by themselves, at once.
         varying_entry: nodes at which a part of each enters what passes on.
         varying_part: how much.
     """
 
-    def __init__(self, admissible: Admissible, substeps: int) -> None:
-        """Find them in the network of ``admissible``, which the simulator advances by ``substeps`` an interval."""
+    def __init__(self, admissible: Admissible, substeps: int, *, steady_parts: bool) -> None:
+        """Find them in the network of ``admissible``, which the simulator advances by ``substeps`` an interval.
+
+        Flows that may vary have constant parts if ``steady_parts``.
+        """
         network = self._network = admissible.network
         self._admissible, stores = admissible, len(network.stores)
         kinds = np.unique(admissible.kinds).tolist()
@@ -74,16 +82,21 @@ class Transit:
         self.constant = (admissible.by_schedule | lines) & ~(refilled & (substeps > 1))
         self._dry = admissible.by_schedule & ~lines & ~refilled
         nodes = np.arange(len(network.nodes))
-        entered = np.isin(nodes, network.recipients[self.constant]) & (nodes >= stores)
+        chains = [lifetime for lifetime in whole if len(lifetime.rate)]
+        exits = np.array([chain.exit_arc for chain in chains], dtype=np.intp)
+        is_steady = np.array([steady_parts and not chain.factor.size for chain in chains], dtype=bool)
+        varying_orders = np.flatnonzero(refilled & ~self.constant)
+        self.partly_steady = np.union1d(exits[is_steady], varying_orders if steady_parts else []).astype(np.intp)
+        constant_recipients = network.recipients[self.constant | np.isin(arcs, self.partly_steady)]
+        entered = np.isin(nodes, constant_recipients) & (nodes >= stores)
         leads = self._spread(np.isin(nodes, self.splits), nodes >= stores, against=True)
         self.nodes = np.flatnonzero(self._spread(entered, nodes >= stores) & leads)
         self.arcs = np.flatnonzero(np.isin(network.donors, self.nodes))
-        chains = [lifetime for lifetime in whole if len(lifetime.rate)]
-        exits = np.array([chain.exit_arc for chain in chains], dtype=np.intp)
         self.lives = network.donors[exits]
-        at_once = [(arc, life.exit_arc, life.chain.weights[0]) for life in chains for arc in life.inflow_arcs.tolist()]
+        whole_flow = [chain for chain, steady in zip(chains, is_steady.tolist(), strict=True) if not steady]
+        at_once = [(k, life.exit_arc, life.chain.weights[0]) for life in whole_flow for k in life.inflow_arcs.tolist()]
         # flows that may fall by themselves: which, where a part of it enters, and the part
-        varies = [*((arc, arc, 1.0) for arc in np.flatnonzero(refilled & ~self.constant).tolist())]
+        varies = [(arc, arc, 1.0) for arc in varying_orders.tolist()]
         varies += [(arc, arc, 1.0) for arc in exits.tolist()] + [term for term in at_once if term[2] > 0]
         flow, entry, part = zip(*varies, strict=True) if varies else ((), (), ())
         self.varying_flow = np.array(flow, dtype=np.intp)
@@ -123,6 +136,7 @@ class Transit:
         passed = self._spread(nodes == split, hands_on, against=True)
         into = passed[network.recipients] & self._stock_driven
         varies_life = np.append(fast, np.zeros(len(nodes) - stores, dtype=bool)) & lives
+        varies_life |= lives & np.isin(nodes, network.donors[self.partly_steady])
         slow = np.isin(nodes, network.donors[into]) & ~hands_on & ~varies_life
         fast_nodes = passed & (nodes < stores)
         direct = self._spread(nodes == split, nodes >= stores, against=True)
@@ -143,7 +157,10 @@ class Transit:
 
 
 def steady_rows(transit: Transit, ranges: IntervalRanges, equal: ProgramRows, under: ProgramRows) -> None:
-    """Add what holds of the constant parts A of throughputs and a of flows; keys (4, family, index, side)."""
+    """Add what holds of the constant parts A of throughputs and a of flows; keys (4, family, index, side).
+
+    What lifetimes have of a is in their own rows (``Lifetimes.rows``).
+    """
     network, layout, nodes, arcs = ranges.network, equal.layout, transit.nodes, transit.arcs
     if not len(nodes):
         return
@@ -153,6 +170,13 @@ def steady_rows(transit: Transit, ranges: IntervalRanges, equal: ProgramRows, un
     equal.put(row[nodes], node_column[nodes], -1.0)
     sources = np.flatnonzero(transit.constant & np.isin(network.recipients, nodes))
     equal.put(row[network.recipients[sources]], layout.flow[0] + sources, 1.0)
+    parts = transit.partly_steady[np.isin(network.recipients[transit.partly_steady], nodes)]
+    equal.put(row[network.recipients[parts]], arc_column[parts], 1.0)
+    orders = transit.partly_steady[ranges.by_schedule[transit.partly_steady]]
+    cut = under.add(4, 4, orders)
+    under.put(cut, layout.flow[0] + orders, 1.0)
+    under.put(cut, arc_column[orders], -1.0)
+    under.loosen(cut, orders, 1.0)
     inner = arcs[np.isin(network.recipients[arcs], nodes)]
     equal.put(row[network.recipients[inner]], arc_column[inner], 1.0)
     low, high = ranges.rate
@@ -180,7 +204,7 @@ def _columns(layout: Layout) -> tuple[Integers, Integers]:
     """Return the columns of A of each node, and of a of each arc; −1 where there is none."""
     node, arc = np.full(len(layout.network.nodes), -1), np.full(len(layout.network.arcs), -1)
     node[layout.steady_nodes] = layout.steady + np.arange(len(layout.steady_nodes))
-    arc[layout.steady_arcs] = layout.steady + len(layout.steady_nodes) + np.arange(len(layout.steady_arcs))
+    arc[layout.steady_arcs] = layout.steady_column(layout.steady_arcs)
     return node, arc
 
 
@@ -294,7 +318,7 @@ class ConstantShares:
     def _allow_varying(
         self, rows: Integers, donor: int, spread: Floats, sources: Sources, moments: Integers, ratio: Floats
     ) -> None:
-        """Allow for flows that may fall otherwise: they pass at once, and past fast stocks later."""
+        """Allow for what may fall otherwise of flows: it passes at once, and past fast stocks later."""
         layout, transit, (direct, behind) = self.layout, self.transit, sources.varying
         at = moments[:, None, None, None]
         # what flows by schedule is constant in a substep
@@ -302,6 +326,14 @@ class ConstantShares:
         kept = np.where(is_substep & self.ranges.by_schedule[transit.varying_flow[direct]], 1.0 - ratio, 1.0)
         weight = kept * transit.varying_part[direct] * self._visits(donor, transit.varying_entry[direct])
         self.rows.put(rows[..., None], layout.flow[at] + transit.varying_flow[direct], -spread * weight)
+        self._put_steady(rows, direct, spread * weight)
         share = transit.varying_part[behind] * self._most_outflow(donor, sources) / len(layout.moments)
         columns = layout.flow[:, None] + transit.varying_flow[behind]
         self.rows.put(rows[..., None, None], columns, -spread[..., None] * share)
+        self._put_steady(rows, behind, spread * share * len(layout.moments))
+
+    def _put_steady(self, rows: Integers, places: Integers, weight: Floats) -> None:
+        """Put weights of the constant parts of flows that may fall otherwise, shape (..., places), into rows."""
+        arcs = self.transit.varying_flow[places]
+        steady = np.isin(arcs, self.transit.partly_steady)
+        self.rows.put(rows[..., None], self.arc_column[arcs[steady]], weight[..., steady])
