@@ -223,15 +223,15 @@ def test_what_passes_markets_is_what_steps_from_nothing_come_to(seed: int) -> No
             break
     passed = np.bincount(staged.recipients, flow[:, 0], len(staged.nodes))[orders.markets]
     np.testing.assert_allclose(through[:, 0], passed, rtol=1e-10, atol=1e-10)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr("cirl_marl.dynamics.orders.BLOCKS", 0)
+        np.testing.assert_allclose(orders.clear(rate, flow)[0], through, rtol=1e-10, atol=1e-10)
     # where just as much is ordered as there is, both what has enough and what has not is right
     total = np.bincount(staged.donors[orders.arcs], rate[orders.arcs, 0], len(staged.nodes))
     part = np.divide(through[:, 0], total[orders.markets], out=np.ones(len(through)), where=total[orders.markets] > 0)
     part = np.minimum(part, 1.0)[np.searchsorted(orders.markets, staged.donors[orders.arcs])]
     rate[orders.arcs] *= part[:, None]
     np.testing.assert_allclose(orders.clear(rate, flow)[0], through, rtol=1e-10, atol=1e-10)
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr("cirl_marl.dynamics.orders.BLOCKS", 0)
-        np.testing.assert_allclose(orders.clear(rate, flow)[0], through, rtol=1e-10, atol=1e-10)
 
 
 def test_fixed_points_are_found_in_as_many_steps_as_there_are_unknowns() -> None:
