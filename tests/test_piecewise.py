@@ -150,6 +150,18 @@ def test_least_cost_of_two_technologies_is_that_of_a_program_by_hand() -> None:
     assert other.objective - 1e-6 * best <= float(solved.at(start)) <= other.objective + 0.01 * best
 
 
+def test_the_most_that_can_be_booked_is_bounded_exactly() -> None:
+    """Where more is wanted chords count, which are exact where all that flows and is held is the most there can be."""
+    network = technologies()
+    proved = bound(network, aim={"cost": -1.0})
+    full = replace(proved, actions=np.tile([1.0 if agent != "use" else -1.0 for agent in proved.agents], (STEPS, 1)))
+    assert simulate_plan(full).accounts[0, 0] == pytest.approx(proved.objective, rel=1e-6)
+    layout, high = proved.problem.layout, proved.problem.high.reshape(STEPS, -1)
+    held = START + 240.0 * (np.arange(STEPS) + 0.5)  # old and new, and half of it in the mean of an interval
+    np.testing.assert_allclose(high[:, layout.excess], held - HELD.to[0])
+    np.testing.assert_allclose(high[:, layout.excess + 1 :], np.tile([80.0, 40.0, 70.0], (STEPS, 1)))
+
+
 def market() -> Network:
     """Return a store of which more sells at a lower price, and that costs more the more is in it; changes cost, too."""
     earns = PiecewiseRate(to=(4.0, 7.0), rates=(-5.0, -2.0, 1.0), factor=series((1.0, 0.3, 1.2, 0.9, 0.5, 1.0)))
