@@ -160,6 +160,10 @@ def test_the_most_that_can_be_booked_is_bounded_exactly() -> None:
     held = START + 240.0 * (np.arange(STEPS) + 0.5)  # old and new, and half of it in the mean of an interval
     np.testing.assert_allclose(high[:, layout.excess], held - HELD.to[0])
     np.testing.assert_allclose(high[:, layout.excess + 1 :], np.tile([80.0, 40.0, 70.0], (STEPS, 1)))
+    served = bound(network, aim={"cost": -1.0}, min_service=1)
+    stock, excess = served.stock[:, 1], served.solution.reshape(STEPS, -1)[:, layout.excess]
+    np.testing.assert_allclose(excess, (1 - HELD.to[0] / held) * (stock[1:] + stock[:-1]) / 2, rtol=1e-6)
+    assert (excess[1:] < high[1:, layout.excess] - 1.0).all()
 
 
 def market() -> Network:
