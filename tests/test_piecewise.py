@@ -405,6 +405,11 @@ def test_files_state_pieces_in_any_unit(tmp_path: Path) -> None:
     assert network.uncertain["arcs.new.accounts.cost"].deviation == 0.1
     of_mean = load_network(rising_file(tmp_path, f"{rate}, deviation = 0.0085 }}"))
     assert of_mean.uncertain["arcs.new.accounts.cost"].deviation == pytest.approx(0.2)
+    ranged = load_network(rising_file(tmp_path, f"{rate}, range = [0.03, 0.06] }}"))
+    write_network(ranged, tmp_path / "ranged.toml")
+    again = load_network(tmp_path / "ranged.toml")
+    assert again.uncertain["arcs.new.accounts.cost"].low == pytest.approx(0.03 / 0.0425)
+    assert again.uncertain["arcs.new.accounts.cost"].high == pytest.approx(0.06 / 0.0425)
     disturbance = (
         '\n[disturbances.wage]\nkind = "markov"\nvalues = [1, 3]\nmatrix = [[0.5, 0.5], [0.5, 0.5]]\n'
         'unit = "1"\nsource = "s"\n'
