@@ -26,6 +26,7 @@ from cirl_marl.optimum.kernels import Kernel
 from cirl_marl.optimum.mpc import MPC
 from cirl_marl.optimum.options import by_stage
 from cirl_marl.optimum.program import Programs
+from cirl_marl.optimum.solver import solve
 from cirl_marl.optimum.vintages import Lifetimes
 
 Floats = NDArray[np.floating]
@@ -53,7 +54,7 @@ def test_kernels_enclose_what_leaves(distribution: str, deviation: float, mean: 
     kernel = Kernel(chain, rate, 1.0, degree)
     inflow = rng.uniform(0, 1, (pieces, 20)).repeat(FINE // 20, axis=1)
     stages = start = rng.random(chain.stages)
-    leaving = np.empty((pieces, FINE))
+    leaving, stock = np.empty((pieces, FINE)), np.empty(pieces)
     for p in range(pieces):
         size = chain.stages
         system = np.zeros((size + 1, size + 1))
@@ -63,12 +64,19 @@ def test_kernels_enclose_what_leaves(distribution: str, deviation: float, mean: 
             middle = half[:size, :size] @ stages + half[:size, size] * inflow[p, k]
             leaving[p, k] = rate[p] * middle[-1] + chain.weights[0] * inflow[p, k]
             stages = whole[:size, :size] @ stages + whole[:size, size] * inflow[p, k]
+        stock[p] = stages.sum()
     entered, left = weighted(inflow, degree), weighted(leaving, degree)
     known = kernel.start_outflow @ start
     low, high = (known + np.einsum("piqj,qj->pi", each, entered) for each in (kernel.low, kernel.high))
     rounding = 1e-4 * left.max()  # of the fine steps
     assert (low <= left + rounding).all() and (left <= high + rounding).all()
+    least, most = (
+        kernel.start_survivors @ start + np.einsum("pqj,qj->p", each, entered)
+        for each in (kernel.survivors_low, kernel.survivors_high)
+    )
+    assert (least <= stock * (1 + 1e-9)).all() and (stock <= most * (1 + 1e-9)).all()
     if mean > 20:
+        assert (most - least).max() < 1e-4 * stock.max()
         assert (high - low).max() < (2e-3 if degree == 1 else 2e-4) * left.max()
 
 
@@ -91,6 +99,8 @@ def test_rows_and_boxes_hold_in_an_episode(lifetime: Lifetime, stretch: float | 
     left = weighted(run.flow[:, network.arc_index["discard"]].reshape(-1, FINE), 2).reshape(years, -1)
     (each,) = lifetimes.whole
     values = np.zeros((years, layout.size))
+    stock = run.stock[FINE - 1 :: FINE, network.node_index["use"]]
+    values[:, layout.end + network.node_index["use"]] = stock.reshape(years, -1)
     for i, moment in enumerate(layout.moments):
         values[:, layout.flow[moment] + each.exit_arc] = left[:, i]
         values[:, layout.flow[moment] + each.inflow_arcs[0]] = INFLOW[:years]
@@ -134,6 +144,28 @@ def test_rows_hold_however_a_lifetime_is_stretched(lifetime: Lifetime, style: st
             assert (matrix @ values[first:].ravel() <= to + 1e-9 * to.max()).all()
         stretches = lifetimes.planned_stretches(layout, values, starts[0], range(years))["use"]
         np.testing.assert_allclose(stretches, 0.8 + 0.5 * (actions + 1) / 2, rtol=1e-6)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize("is_stretched", [False, True])
+def test_the_least_and_most_in_use_are_what_always_lives_shortest_and_longest(is_stretched: bool, side: float) -> None:
+    """Of a short life and one piece a year, where bounds of what leaves are 5 % apart, those of what is left not."""
+    control = Control(kind=ControlKind.STRETCH, low=0.9, neutral=1.0, high=1.2) if is_stretched else None
+    lifetime, years = Lifetime(mean=3.0, deviation=1.0, distribution="lognormal"), 12
+    network = town(lifetime, INFLOW[:years], initial=30.0, control=control)
+    programs = Programs(Admissible.of(network), 2, None, merge_pieces=True)
+    layout, use = programs.layout, network.node_index["use"]
+    problem = programs.program(by_stage(network, programs.admissible.lifetimes.state_layout, network.initial[1]))
+    cost = np.zeros_like(problem.cost)
+    cost[-layout.size + layout.last.start + use] = -side
+    plan = solve(replace(problem, cost=cost)).plan
+    env = MultiAgentVectorEnv(network, num_envs=1)
+    env.reset(seed=0)
+    for _ in range(years):
+        env.advance(np.full((int(is_stretched), 1), side))
+    stock = float(env.rows.stocks(env.physical.stock)[use, 0])
+    assert layout.pieces == 1
+    assert -1e-9 <= side * (-side * float(cost @ plan) / stock - 1.0) <= 5e-3
 
 
 @pytest.mark.sample(3)

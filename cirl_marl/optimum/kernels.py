@@ -26,6 +26,9 @@ class Kernel:
         start_outflow: of what is there in each stage, shape (pieces, d + 1, stages), 1/time.
         low: c̲ of each piece and moment, by those of what enters, shape (pieces, d + 1, pieces, d + 1).
         high: c̄, likewise; both with w_0.
+        start_survivors: what is left at the end of each piece of what is there in each stage, shape (pieces, stages).
+        survivors_low: of what entered, below, by the means of what enters, shape (pieces, pieces, d + 1), time.
+        survivors_high: above, likewise.
     """
 
     def __init__(self, chain: Chain, rate: Floats, length: float, degree: int) -> None:
@@ -33,6 +36,8 @@ class Kernel:
         pieces, stages, moments = len(rate), chain.stages, degree + 1
         shape = (pieces, moments, pieces, moments)
         self.start_outflow, self.low, self.high = np.zeros((pieces, moments, stages)), np.zeros(shape), np.zeros(shape)
+        self.start_survivors = np.zeros((pieces, stages))
+        self.survivors_low, self.survivors_high = np.zeros((2, pieces, pieces, moments))
         unit = chain.matrix / chain.rate
         motions = {mu: _Motion(unit, mu * length, chain.inflow_shares, degree) for mu in np.unique(rate).tolist()}
         parts = [motions[mu] for mu in rate.tolist()]
@@ -40,6 +45,8 @@ class Kernel:
         for p, motion in enumerate(parts):
             self.start_outflow[p] = motion.outflow @ transfer / length
             transfer = motion.whole @ transfer
+            self.start_survivors[p] = transfer.sum(axis=0)
+        survivors = np.empty((0, stages))
         for q in reversed(range(pieces)):
             # of what is there at the end of piece q, what leaves in each later one
             if q + 1 < pieces:
@@ -48,13 +55,24 @@ class Kernel:
             for target, bounds in ((slice(q, q + 1), parts[q].own_bounds), (slice(q + 1, pieces), later_bounds)):
                 low, high = (bound.reshape(-1, moments, moments) for bound in bounds)
                 self.low[target, :, q], self.high[target, :, q] = low, high
+            # of what is there at the end of piece q, what is left at the ends of this and the later ones
+            survivors = np.concatenate([np.ones((1, stages)), survivors])
+            bounds = parts[q].later.bounds(survivors * length / moments)
+            self.survivors_low[q:, q], self.survivors_high[q:, q] = (bound[:, 0] for bound in bounds)
+            survivors = survivors @ parts[q].whole
         at_once = chain.weights[0] * np.eye(pieces * moments).reshape(shape)
         self.low += at_once
         self.high += at_once
 
+    @property
+    def looseness(self) -> float:
+        """How far bounds of what leaves in the last piece are apart, relative to it, where as much enters always."""
+        low, high = (bound[-1].sum(axis=(1, 2)) for bound in (self.low, self.high))
+        return float(((high - low) / high).max())
 
-def unit_outflow(chain: Chain, rate: Floats, length: float, degree: int) -> Floats:
-    """Return what leaves of a unit of mass that has just entered a chain at the start of each piece, and has stayed.
+
+def unit_outflow(chain: Chain, rate: Floats, length: float, degree: int) -> tuple[Floats, Floats]:
+    """Return what leaves, and what is left, of a unit of mass that has just entered a chain, and has stayed.
 
     Args:
         chain: the stages; what leaves at once, w_0, is not of it.
@@ -64,17 +82,18 @@ def unit_outflow(chain: Chain, rate: Floats, length: float, degree: int) -> Floa
 
     Returns:
         Means weighted with B_i over each piece p of what entered at the start of piece q, 1/time, shape
-        (q, p, d + 1); 0 before.
+        (q, p, d + 1), and what is left of it at the end of p, shape (q, p); 0 before.
     """
     parts = {mu: bernstein_means(chain.matrix / chain.rate * mu * length, degree) for mu in np.unique(rate).tolist()}
-    outflow = np.zeros((len(rate), len(rate), degree + 1))
+    outflow, survivors = np.zeros((len(rate), len(rate), degree + 1)), np.zeros((len(rate), len(rate)))
     stock = np.zeros((chain.stages, len(rate)))
     for p, mu in enumerate(rate.tolist()):
         means, whole = parts[mu]
         stock[:, p] = chain.inflow_shares / chain.inflow_shares.sum()
         outflow[:, p] = (mu * means[:, -1] @ stock).T
         stock = whole @ stock
-    return outflow
+        survivors[:, p] = stock.sum(axis=0)
+    return outflow, survivors
 
 
 class _Motion:

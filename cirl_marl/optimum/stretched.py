@@ -59,8 +59,8 @@ class StretchedRows:
         sums = sparse.kron(sparse.eye_array(self._steps), np.full((1, len(layout.moments)), layout.portion))
         left, entered = sums @ outflow, sums @ inflow
         rows = [
-            stock - self._survivor_rows(longest.low) @ inflow,
-            self._survivor_rows(shortest.high) @ inflow - stock,
+            stock - _by_moment(longest.survivors_high) @ inflow,
+            _by_moment(shortest.survivors_low) @ inflow - stock,
             left - sparse.csr_array(self._high) @ entered,
             sparse.csr_array(self._low) @ entered - left,
         ]
@@ -68,21 +68,14 @@ class StretchedRows:
 
     def limits(self, masses: Floats) -> Floats:
         """Return the limits of the rows from masses in the stages."""
-        most, least = (
-            masses.sum() - self._layout.portion * np.cumsum((kernel.start_outflow @ masses).sum(axis=1))
-            for kernel in self._kernels
-        )
+        most, least = (kernel.start_survivors @ masses for kernel in self._kernels)
         low, high = _start_bounds(masses, self._windows)
         return np.concatenate([most, -least, high, -low])
 
-    def _survivor_rows(self, discards: Floats) -> Any:
-        """Return what is left at the end of each piece of what entered in each moment, (pieces, moments), sparse.
 
-        It is the most if ``discards``, shape (pieces, d + 1, pieces, d + 1), is the least, and the other way round.
-        """
-        pieces, portion = len(discards), self._layout.portion
-        entered = np.kron(np.tri(pieces), np.full((1, discards.shape[1]), portion))
-        return sparse.csr_array(entered - portion * np.cumsum(discards.sum(axis=1), axis=0).reshape(pieces, -1))
+def _by_moment(bound: Floats) -> Any:
+    """Return bounds of what is left at the end of each piece as a matrix of the moments that entered, sparse."""
+    return sparse.csr_array(bound.reshape(len(bound), -1))
 
 
 class _Windows:

@@ -41,6 +41,8 @@ from cirl_marl.optimum.stretched import StretchedRows, planned_turnovers
 
 LOOSE = 2e-4
 """Distance of the bounds of what leaves, relative to it, above which intervals have more pieces."""
+FAR = 2.5e-3
+"""The same, above which what is left is bounded too: where there are no more pieces, and lives are short."""
 
 
 @positional_record
@@ -186,9 +188,9 @@ class Lifetimes:
     def _looseness(self, lifetime: WholeLifetime, pieces: int, degree: int) -> float:
         """Return how far bounds of what leaves are apart, relative to it, where as much enters all the time."""
         rate = np.full(pieces * self.network.episode.horizon, lifetime.rate.max())
-        kernel = Kernel(lifetime.chain, rate, self.network.episode.control_interval / pieces, degree)
-        low, high = (bound[-1].sum(axis=(1, 2)) for bound in (kernel.low, kernel.high))
-        return float(((high - low) / high).max())
+        key = ("looseness", lifetime.node.id, float(rate[0]), pieces, degree)
+        length = self.network.episode.control_interval / pieces
+        return self.cache.value(key, lambda: Kernel(lifetime.chain, rate, length, degree).looseness)
 
     def entries(self, layout: Layout) -> int:
         """Return how many entries the rows of an episode have, about."""
@@ -220,13 +222,20 @@ class Lifetimes:
             # L − c̄ U ≤ from_start and c̲ U − L ≤ −from_start, in the columns of what leaves and of what enters
             write = self._chain_kernels if len(lifetime.rate) else self._line_kernels
             low, high, from_start = write(lifetime, layout, initial, intervals)
-            blocks.append(sparse.vstack([outflow - high @ inflow, low @ inflow - outflow], format="csr"))
-            limits.append(np.concatenate([from_start, -from_start]))
+            blocks += [outflow - high @ inflow, low @ inflow - outflow]
+            limits += [from_start, -from_start]
             if len(lifetime.rate) and lifetime.exit_arc in layout.steady_arcs:
                 steady = np.arange(len(intervals))[:, None] * layout.size + layout.steady_column(lifetime.exit_arc)
                 earlier = _least_later(low, len(layout.moments))
                 blocks.append(earlier @ inflow - _column_sums(steady, width))
                 limits.append(-from_start.reshape(len(intervals), -1).min(axis=1))
+            if self._bounds_stock(lifetime, layout):
+                stock = _column_sums(ends + self.plan_network.node_index[lifetime.node.id], width)
+                kernel = self._kernel(lifetime, layout, intervals)
+                low, high = (bound.reshape(len(ends), -1) for bound in (kernel.survivors_low, kernel.survivors_high))
+                survivors = kernel.start_survivors @ lifetime.masses(initial)
+                blocks += [stock - sparse.csr_array(high) @ inflow, sparse.csr_array(low) @ inflow - stock]
+                limits += [survivors, -survivors]
         return sparse.vstack(blocks, format="csr"), np.concatenate(limits)
 
     def of_new(self, lifetime: WholeLifetime, layout: Layout) -> Floats:
@@ -242,13 +251,16 @@ class Lifetimes:
             return self._stretch_new(lifetime, layout)
         if len(lifetime.rate):
             rate = np.repeat(lifetime.rate, layout.pieces)
-            outflow = unit_outflow(lifetime.chain, rate, layout.length, layout.degree)
-            outflow = outflow[:: layout.pieces].reshape(steps, -1)
+            outflow, survivors = (
+                part[:: layout.pieces].reshape(steps, -1)
+                for part in unit_outflow(lifetime.chain, rate, layout.length, layout.degree)
+            )
         else:
             delay = lifetime.rows.shape[1] - 1
             shares = np.kron(np.eye(steps, k=delay - 1), np.ones((1, moments)))
             outflow = np.asarray(shares / self.network.episode.control_interval, dtype=float)
-        return np.concatenate([outflow, -outflow], axis=1)
+        ends = [survivors, -survivors] if self._bounds_stock(lifetime, layout) else []
+        return np.concatenate([outflow, -outflow, *ends], axis=1)
 
     def planned_stretches(self, layout: Layout, plan: Floats, initial: Floats, intervals: range) -> dict[str, Floats]:
         """Return the stretches of a plan, by agent: those that leave its stocks at the end of each interval.
@@ -294,12 +306,19 @@ class Lifetimes:
         self, lifetime: WholeLifetime, layout: Layout, initial: Floats, intervals: range
     ) -> tuple[Any, Any, Floats]:
         """Return c̲ and c̄ of what leaves a chain, sparse, and what leaves of what is there at the start."""
-        rate = lifetime.rate[intervals.start : intervals.stop]
-        key = ("kernel", lifetime.node.id, rate.tobytes(), layout.pieces, layout.degree)
-        by_piece, count = np.repeat(rate, layout.pieces), len(intervals) * len(layout.moments)
-        kernel = self.cache.value(key, lambda: Kernel(lifetime.chain, by_piece, layout.length, layout.degree))
+        kernel, count = self._kernel(lifetime, layout, intervals), len(intervals) * len(layout.moments)
         low, high = (sparse.csr_array(bound.reshape(count, count)) for bound in (kernel.low, kernel.high))
         return low, high, (kernel.start_outflow @ lifetime.masses(initial)).ravel()
+
+    def _kernel(self, lifetime: WholeLifetime, layout: Layout, intervals: range) -> Kernel:
+        rate = lifetime.rate[intervals.start : intervals.stop]
+        key = ("kernel", lifetime.node.id, rate.tobytes(), layout.pieces, layout.degree)
+        by_piece = np.repeat(rate, layout.pieces)
+        return self.cache.value(key, lambda: Kernel(lifetime.chain, by_piece, layout.length, layout.degree))
+
+    def _bounds_stock(self, lifetime: WholeLifetime, layout: Layout) -> bool:
+        """Whether bounds of what leaves are so far apart that what is left is bounded too."""
+        return len(lifetime.rate) > 0 and self._looseness(lifetime, layout.pieces, layout.degree) > FAR
 
     def _line_kernels(
         self, lifetime: WholeLifetime, layout: Layout, initial: Floats, intervals: range
