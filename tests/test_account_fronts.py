@@ -37,6 +37,7 @@ from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
 from cirl_marl.evaluation.account_front import AccountFront, _Sweep, volume_dominated
 from cirl_marl.network.elements import Role
 from cirl_marl.optimum import bound, improve_plan, simulate_plan, supply_limits
+from cirl_marl.optimum.bounds import tight_bound
 from cirl_marl.optimum.supply_limits import _with_ends, with_supply_limits
 
 
@@ -236,6 +237,17 @@ def test_good_episodes_stay_what_they_are_under_limits() -> None:
             np.testing.assert_allclose(run.flow, middle_episode(narrow, action).flow, rtol=1e-9)
             good += 1
     assert 1 <= good < 12
+
+
+@pytest.mark.slow
+def test_nothing_is_put_into_use_late_and_sold_early_in_each_year() -> None:
+    """The bound of Japan's steel is 0.4 kt above its plan; 5.4 where shares may move with flows that hardly vary."""
+    free = bound("steel_japan", min_service=1.0)
+    reached = float(simulate_plan(improve_plan(free)).episode_circularity[0])
+    narrow = with_supply_limits(free, reached - 200.0)
+    tight = tight_bound(narrow, min_service=1.0, aim="circularity")
+    assert tight.verify().bound == tight.objective
+    assert 0.0 <= tight.objective - reached < 0.7
 
 
 def middle_episode(network: Network, action: float) -> Rollout:

@@ -14,8 +14,20 @@ from test_lifetimes import INFLOW, LIVES, town
 
 from benchmarks.products import product_cycle
 from benchmarks.yearly import LIFETIMES, yearly_network
-from cirl_marl import Control, ControlKind, MultiAgentVectorEnv, Series, Service
-from cirl_marl.controllers import Neutral
+from cirl_marl import (
+    Arc,
+    Control,
+    ControlKind,
+    Episode,
+    Law,
+    MultiAgentVectorEnv,
+    Network,
+    Node,
+    Role,
+    Series,
+    Service,
+)
+from cirl_marl.controllers import Constant, Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.network.elements import CIRCULARITY, Lifetime
 from cirl_marl.network.lifetimes import chain_of
@@ -240,6 +252,32 @@ def test_constant_parts_of_lifetimes_are_nearly_all_that_leaves(lifetime: Lifeti
     assert (least <= left).all() and (
         left - least <= 10.0 * (in_a_year + 0.8 / (lifetime.deviation * np.sqrt(2 * np.pi)))
     ).all()
+
+
+def test_what_leaves_beside_the_constant_part_may_fall_at_once() -> None:
+    """Shares of what leaves a stock that nothing enters any more, which is least at the end of each year."""
+    share = Control(kind=ControlKind.SHARE, low=0.1, neutral=0.5, high=0.9)
+    network = Network(
+        name="yard",
+        nodes=(
+            Node(id="use", lifetime=Lifetime(mean=3.0, deviation=1.0, distribution="normal"), initial=(90.0, 90.0)),
+            Node(id="sorting", stores=False),
+            Node(id="scrap", initial=(0.0, 0.0)),
+            Node(id="tip", role=Role.LANDFILL),
+        ),
+        arcs=(
+            Arc(id="old", donor="use", recipient="sorting", law=Law.SHARE),
+            Arc(id="recovery", donor="sorting", recipient="scrap", law=Law.SHARE, control=share),
+            Arc(id="rest", donor="sorting", recipient="tip", law=Law.SHARE),
+        ),
+        time_unit="year",
+        episode=Episode(horizon=3),
+    )
+    env = MultiAgentVectorEnv(network, num_envs=1)
+    most = tight_bound(network, min_service=0.0, aim=CIRCULARITY).objective
+    reached = [float(rollout(env, Constant({"recovery": action})).episode_circularity[0]) for action in (-1, 0, 1)]
+    assert reached[0] < reached[1] < reached[2] == pytest.approx(most, rel=1e-3)
+    assert reached[2] <= most + 1e-9 * abs(most)
 
 
 @pytest.mark.slow

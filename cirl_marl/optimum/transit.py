@@ -11,8 +11,8 @@ what these held at the start of the interval is allowed for (theorem 3). What ma
 flows: by schedule from a stock that is refilled, out of lifetimes with fast stages, or through lifetimes at once.
 
 Of such flows, and of all that leaves lifetimes that nobody stretches, A may have a part a_k too, at most what flows at
-any time of the interval (``partly_steady``). An order from a refilled stock is all of it, unless it may be cut; out of
-a lifetime comes at least what follows from all that entered in earlier intervals.
+any time of the interval (``partly_steady``). An order from a refilled stock is all of it, unless it may be cut; of what
+entered a lifetime, and of what was there, the least that leaves in any moment.
 """
 
 from __future__ import annotations

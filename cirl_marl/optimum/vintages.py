@@ -226,8 +226,8 @@ class Lifetimes:
             limits += [from_start, -from_start]
             if len(lifetime.rate) and lifetime.exit_arc in layout.steady_arcs:
                 steady = np.arange(len(intervals))[:, None] * layout.size + layout.steady_column(lifetime.exit_arc)
-                earlier = _least_later(low, len(layout.moments))
-                blocks.append(earlier @ inflow - _column_sums(steady, width))
+                least = low.toarray().reshape(len(intervals), -1, low.shape[1]).min(axis=1)
+                blocks.append(sparse.csr_array(least) @ inflow - _column_sums(steady, width))
                 limits.append(-from_start.reshape(len(intervals), -1).min(axis=1))
             if self._bounds_stock(lifetime, layout):
                 stock = _column_sums(ends + self.plan_network.node_index[lifetime.node.id], width)
@@ -331,12 +331,6 @@ class Lifetimes:
         shift = sparse.eye_array(steps, k=-delay) if delay < steps else sparse.csr_array((steps, steps))
         kernel = sparse.csr_array(sparse.kron(shift, np.full((moments, moments), 1.0 / moments)))
         return kernel, kernel, from_start.ravel()
-
-
-def _least_later(low: Any, moments: int) -> Any:
-    """Return the least of c̲ in an interval, of what enters in earlier ones, sparse, shape (intervals, moments)."""
-    least = low.toarray().reshape(-1, moments, low.shape[1]).min(axis=1)
-    return sparse.csr_array(np.where(np.arange(low.shape[1]) // moments < np.arange(len(least))[:, None], least, 0.0))
 
 
 def _column_sums(columns: Integers, width: int) -> Any:
