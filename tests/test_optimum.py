@@ -44,6 +44,7 @@ from cirl_marl.optimum import (
     bound,
     envelope,
     improve_plan,
+    program,
     reach,
     simulate_plan,
 )
@@ -319,14 +320,35 @@ def test_exogenous_series_that_is_cut_still_bounds() -> None:
     assert run.episode_circularity[0] <= found.objective <= 0
 
 
-def test_controls_held_to_first_order_lie_below_the_bound() -> None:
-    """Rows that hold the controls within an interval can only lower the optimum, and neutral control satisfies them."""
-    admissible = Admissible.of(load_network("copper_net").with_options(episode={"horizon": 8}))
-    start = starting_stocks(admissible.lifetimes, None)
-    free, held = (Programs(admissible, 2, None, hold_controls=each).program(start) for each in (False, True))
-    best, planned = (-float(problem.cost @ solve(problem).plan) for problem in (free, held))
-    neutral = rollout(MultiAgentVectorEnv("copper_net", num_envs=1, horizon=8), Neutral()).episode_circularity[0]
-    assert neutral < planned <= best + 1e-9
+@pytest.mark.parametrize("rate", [1e-6, 9e-4, 0.4, 30.0])
+def test_programs_of_means_are_exact_where_inflows_are_even(rate: float) -> None:
+    """They have the mean flows and the stocks of the simulator, however fast a stock is left."""
+    supply = Arc(id="supply", donor="reserve", recipient="use", law=Law.EXOGENOUS, flow=3.0)
+    network = small([RESERVE, USE, TIP], [supply, Arc(id="loss", donor="use", recipient="tip", rate=rate)])
+    programs = Programs(admissible := Admissible.of(network), 0, None)
+    problem, layout = programs.program(starting_stocks(admissible.lifetimes, None)), programs.layout
+    plan = solve(problem).plan.reshape(-1, layout.size)
+    run = rollout(MultiAgentVectorEnv(network, num_envs=1), Neutral())
+    np.testing.assert_allclose(layout.means(plan)[1], run.flow, rtol=1e-7)
+    np.testing.assert_allclose(plan[:, layout.last], run.stock, rtol=1e-7)
+
+
+def test_programs_of_means_hold_controls_from_piece_to_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To first order, near neutral values; of large ones pieces are merged, and there is nothing at their ends."""
+    supply = Arc(id="supply", donor="reserve", recipient="use", law=Law.EXOGENOUS, flow=3.0)
+    loss = Arc(id="loss", donor="use", recipient="tip", rate=30.0, control=valve(0.5, 2.0))
+    admissible = Admissible.of(network := small([RESERVE, USE, TIP], [supply, loss]))
+    programs = Programs(admissible, 0, None)
+    layout, starts = programs.layout, starting_stocks(admissible.lifetimes, None)
+    plan = solve(programs.program(starts)).plan.reshape(-1, layout.size)
+    flow = plan[:, layout.flow + network.arc_index["loss"]]
+    stock = plan[:, layout.stock + network.node_index["use"]]
+    assert layout.pieces > 2 and np.ptp(stock[0]) > 0.1
+    np.testing.assert_allclose(np.diff(flow, axis=1), 60.0 * np.diff(stock, axis=1), atol=1e-6 * flow.max())
+    monkeypatch.setattr(program, "LARGE", 0)
+    merged = Programs(admissible, 0, None).layout
+    assert merged.pieces == 1 and merged.coarse and not merged.has_end_flows
+    assert Programs(admissible, 1, None).layout.has_end_flows
 
 
 def test_gap_falls_with_the_degree() -> None:

@@ -17,6 +17,9 @@ from cirl_marl.optimum.admissible import Admissible, IntervalRanges
 from cirl_marl.optimum.matrices import ProgramRows
 from cirl_marl.optimum.reach import Reach
 
+SMALL_TURNOVER = 1e-3
+"""Turnover in a piece below which a series of it is closer than the formula."""
+
 
 def balances(rows: ProgramRows) -> None:
     """Add Y_i − Y_{i−1} − δ/(d + 1)·S F_i, which is 0, for i = 0 … d (theorem 1); keys (moment, node).
@@ -71,6 +74,25 @@ def flow_laws(ranges: IntervalRanges, equal: ProgramRows, under: ProgramRows) ->
     behind = layout.valve[moment] + np.searchsorted(valves, driver)
     column = np.where(through, behind, layout.stock[moment] + driver)
     hold(2, arcs, layout.flow[moment] + arcs, column, factor)
+
+
+def mean_stocks(ranges: IntervalRanges, rows: ProgramRows) -> None:
+    """Add X − θ x_start − (1 − θ) x_end, which is 0, for plain means of stocks; keys (piece, node, 1).
+
+    If inflow is even in a piece and z = a·δ of the stock leaves in proportion, x − x_∞ falls like e^{−zs}, so that this
+    holds with θ = 1/z − 1/(e^z − 1), which is 1/2 for z = 0. Here a is neutral.
+    """
+    layout, stores = rows.layout, np.arange(len(rows.layout.network.stores))
+    exits = np.flatnonzero(ranges.proportional & (ranges.driver < len(stores)))
+    turnover = np.bincount(ranges.driver[exits], ranges.neutral_rate[exits], len(stores)) * layout.length
+    formula = turnover > SMALL_TURNOVER
+    z = np.where(formula, turnover, 1.0)
+    at_start = np.where(formula, 1.0 / z - 1.0 / np.expm1(z), 0.5 - turnover / 12.0)
+    piece = np.arange(layout.pieces)[:, None]
+    row = rows.add(piece, stores, 1)
+    rows.put(row, layout.stock[piece] + stores, 1.0)
+    rows.put(row, layout.end[piece] + stores, at_start - 1.0)
+    rows.at_start(row, piece, stores, -at_start)
 
 
 def held_controls(driver: Integers, arcs: Integers, rate: Floats, valve: Floats, rows: ProgramRows) -> None:

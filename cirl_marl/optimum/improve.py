@@ -4,8 +4,8 @@ The relaxed flows of a bound are not quite what constant controls can do. Around
 step within a trust region is a linear program (``linearised``). Steps are accepted by simulation alone, so the result
 is an episode that exists.
 
-Of a large network those Jacobians, dense in its stocks and actions, would take gigabytes. ``refine`` solves the program
-of the bound again instead, with controls held and what was lacking on top.
+Of a large network those Jacobians, dense in its stocks and actions, would take gigabytes. ``refine`` solves programs of
+plain means instead, with controls held and what was lacking on top.
 """
 
 from __future__ import annotations
@@ -42,10 +42,8 @@ CORRECTIONS = 4
 """Most programs around an episode, after the first, that are told what the episode of the one before was away from what
 it promised, while that is no better or lacks service: a Jacobian costs as much as many of them."""
 REFINEMENT_ROUNDS = 2
-"""Most programs that are solved. Each takes about as long as the bound: the first makes up for factors that vary in the
-bound's plan, the second for what is left to first order."""
-REFINEMENT_DEGREE = 1
-"""Degree of these programs, whatever that of the bound: they are solved several times."""
+"""Most programs that are solved, each in an eighth of the time of the bound of steel_world: the first makes up for
+factors that vary in the bound's plan, the second for what is left to first order."""
 CONTENT_STARTS = 4
 """Actions to begin from where contents are demanded. Random ones are ends and middles of ranges: of 24 such 8 lead to
 the optimum of Haverly's second pooling problem, of as many uniform ones 3."""
@@ -259,9 +257,9 @@ def refine(
 ) -> Bound:
     """Return ``bound`` with actions that do better in the simulator; the bound and its certificate stay.
 
-    Each round solves the program of the bound with controls that are constant within an interval to first order
-    (``Programs``), which the simulator carries out more faithfully. Where an episode delivers less of a service than
-    its program promised, the next one demands that much more: the lower end l of its band becomes
+    Each round solves the program of plain means (degree 0 of ``Programs``), whose controls are constant within an
+    interval to first order, which the simulator carries out more faithfully. Where an episode delivers less of a
+    service than its program promised, the next one demands that much more: the lower end l of its band becomes
 
         l·(1 + Σ max(0, promised level − delivered level)),
 
@@ -282,9 +280,7 @@ def refine(
         if enough(run):
             break
         demand_ranges = replace(admissible, service_low=admissible.service_low * factor)
-        programs = Programs(
-            demand_ranges, REFINEMENT_DEGREE, bound.service_weight, hold_controls=True, system=bound.problem.system
-        )
+        programs = Programs(demand_ranges, 0, bound.service_weight, system=bound.problem.system)
         try:
             aims = bound.aims.with_lower_budgets(excess)
             problem = programs.program(bound.initial, bound.min_service, aims=aims)

@@ -25,7 +25,7 @@ class Kernel:
     Attributes:
         start_outflow: of what is there in each stage, shape (pieces, d + 1, stages), 1/time.
         low: c̲ of each piece and moment, by those of what enters, shape (pieces, d + 1, pieces, d + 1).
-        high: c̄, likewise; both with w_0.
+        high: c̄, likewise; both with w_0. Of degree 0 they are the same, of an inflow that is even within pieces.
         start_survivors: what is left at the end of each piece of what is there in each stage, shape (pieces, stages).
         survivors_low: of what entered, below, by the means of what enters, shape (pieces, pieces, d + 1), time.
         survivors_high: above, likewise.
@@ -126,8 +126,11 @@ class _Smooth:
     """f(τ) = v e^(M(1 − τ)) z on [0, 1], for many v and z."""
 
     def __init__(self, matrix: Floats, start: Floats, degree: int) -> None:
-        """Expand e^(Mσ) z for the columns z of ``start``."""
-        self._degree, self._columns = degree, start.shape[1]
+        """Expand e^(Mσ) z for the columns z of ``start``; of degree 0 take its mean."""
+        self._margin = MARGIN if degree else 0.0
+        if degree == 0:
+            self._near, self._rest = (bernstein_means(matrix, 0)[0][0] @ start)[:, :, None], np.zeros((*start.shape, 1))
+            return
         count = max(1, math.ceil(float(np.abs(matrix).sum(axis=0).max(initial=0.0)) / 2))
         nodes = (1 - np.cos(np.pi * (2 * np.arange(degree + 1) + 1) / (2 * degree + 2))) / 2
         polynomials = [math.comb(degree, j) * nodes**j * (1 - nodes) ** (degree - j) for j in range(degree + 1)]
@@ -149,7 +152,7 @@ class _Smooth:
         """Return the coefficients of B_j(τ) below and above f, shape (v, z, d + 1) each."""
         near = np.einsum("vn,nzj->vzj", rows, self._near, optimize=True)
         rest = np.einsum("vn,nzj->vzj", rows, self._rest, optimize=True)
-        margin = MARGIN * np.abs(near).max(axis=2, initial=0.0, keepdims=True)
+        margin = self._margin * np.abs(near).max(axis=2, initial=0.0, keepdims=True)
         low = near + rest.min(axis=2, initial=0.0, keepdims=True) - margin
         high = near + rest.max(axis=2, initial=0.0, keepdims=True) + margin
         return low[:, :, ::-1], high[:, :, ::-1]

@@ -28,6 +28,7 @@ from cirl_marl.optimum.constraints import (
     held_controls,
     idle_supplies,
     least_deliveries,
+    mean_stocks,
     order_rows,
     service_levels,
     throughputs,
@@ -94,7 +95,6 @@ class Programs:
         degree: int,
         service_weight: float | None,
         *,
-        hold_controls: bool = False,
         merge_pieces: bool | None = None,
         large: int | None = None,
         constant_shares: bool = True,
@@ -108,15 +108,15 @@ class Programs:
 
         Args:
             admissible: ranges of the flows.
-            degree: d of the test polynomials.
+            degree: d of the test polynomials. With 0 stocks and flows are plain means, of inflows that are even within
+                pieces and controls that are constant in an interval to first order: the program makes better plans and
+                bounds nothing.
             service_weight: w of λ̄/circularity_scale + w·service; None if λ̄ is maximised.
-            hold_controls: whether controls are constant within an interval to first order; the program then makes
-                better plans and bounds nothing.
             merge_pieces: whether an interval has fewer pieces than the simulator has substeps; None: if the program
                 were large otherwise.
             large: variables beyond which it is; None: ``LARGE``.
             constant_shares: whether shares of what passes nodes without stock are constant within an interval, unless
-                controls are held, the program is large or its layout is given.
+                the degree is 0, the program large or its layout given.
             steady_parts: whether what is constant of flows that may vary has variables for these: tighter, and slower.
             system: of a program of the same network and agents, whatever their services demand.
             intervals: that programs will be of; None: of all.
@@ -131,7 +131,7 @@ class Programs:
                 chain_form = Admissible.of(lifetimes.reach_network, admissible.agents, admissible.mixtures)
             system = ComparisonSystem(chain_form, cache)
         self.system = system
-        constant_shares = constant_shares and not hold_controls and layout is None
+        constant_shares = constant_shares and degree > 0 and layout is None
         self._transit: Transit | None = None
         self._ledger = Ledger(lifetimes.network)
         excesses = len(self._ledger.excesses)
@@ -147,20 +147,18 @@ class Programs:
         self._equal, self._under = ChainedRows(layout), ChainedRows(layout)
         period = slice(None) if intervals is None else slice(intervals.start, intervals.stop)
         for kind in np.unique(admissible.kinds[period]).tolist():
-            rows = partial(self._interval_rows, kind, hold_controls, own_system)
+            rows = partial(self._interval_rows, kind, own_system)
             if cache is None:
                 equal_links, equal, under_links, under = rows()
             else:
-                key = ("rows", layout.key, hold_controls, admissible.key(kind))
+                key = ("rows", layout.key, admissible.key(kind))
                 equal_links, equal, under_links, (now, before, looser) = cache.value(key, rows)
                 under = layout.with_levels(now, admissible.service_low[kind]), before, looser
             self._equal.add(kind, equal_links, equal)
             self._under.add(kind, under_links, under)
         self._weights, self._constant = objective(layout, service_weight)
 
-    def _interval_rows(
-        self, kind: int, hold_controls: bool, own_system: ComparisonSystem
-    ) -> tuple[RowParts, RowParts, RowParts, RowParts]:
+    def _interval_rows(self, kind: int, own_system: ComparisonSystem) -> tuple[RowParts, RowParts, RowParts, RowParts]:
         """Return the rows of A of a kind of interval that link it to the one before, the others, and those of G."""
         layout, ranges = self.layout, self.admissible.ranges[kind]
         equal_links, equal, under_links, under = (ProgramRows(layout) for _ in range(4))
@@ -168,13 +166,15 @@ class Programs:
         constant_schedules(ranges, equal, under, across=self._transit is not None)
         flow_laws(ranges, equal, under)
         throughputs(ranges, equal)
-        if hold_controls:
-            held_arcs = np.flatnonzero(ranges.proportional & (ranges.rate[0] < ranges.rate[1]))
-            held_controls(ranges.driver, held_arcs, ranges.neutral_rate[None], ranges.neutral_valve[None], equal)
         delivery_limits(ranges, under_links)
         capacity_limits(ranges, under_links)
         service_levels(ranges, under)
-        decay_rows(ranges, under_links)
+        if layout.degree:
+            decay_rows(ranges, under_links)
+        else:
+            mean_stocks(ranges, equal_links)
+            held_arcs = np.flatnonzero(ranges.proportional & (ranges.rate[0] < ranges.rate[1]))
+            held_controls(ranges.driver, held_arcs, ranges.neutral_rate[None], ranges.neutral_valve[None], equal)
         if layout.has_end_flows:
             end_laws(ranges, equal, under)
             quasi_steady_rows(ranges, own_system.of_interval(kind), under_links)
@@ -320,7 +320,8 @@ def _layout(
     fewer_pieces = max(int(fewer), degree - 1, 1)
     if pieces <= fewer_pieces:
         return fine
-    has_end_flows = bool(merge_pieces) or has_fast_stocks(admissible, network.episode.control_interval / fewer_pieces)
+    length = network.episode.control_interval / fewer_pieces
+    has_end_flows = degree > 0 and (bool(merge_pieces) or has_fast_stocks(admissible, length))
     return make(fewer_pieces, degree, valves, free_valves, coarse=True, has_end_flows=has_end_flows)
 
 
