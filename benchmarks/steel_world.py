@@ -47,8 +47,6 @@ LEVERS = {
 """Levers that nothing speaks against, and the actions of their agents."""
 SHOWN = 8
 """Countries that the tables of levers and of the plan have."""
-DEGREE = 1
-"""Of the test polynomials of the bound."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,7 +216,7 @@ def gain_lines(plan: HasPlan) -> Iterator[str]:
 def planned() -> tuple[HasPlan, Iterator[str]]:
     """Return the plan of the world at full service, and the table that says how good it is."""
     begun = time.process_time()
-    found = bound(load_network(ENVS / "steel_world.toml"), min_service=1.0, degree=DEGREE)
+    found = bound(load_network(ENVS / "steel_world.toml"), min_service=1.0)
     proved = found.verify().bound
     solved = time.process_time()
     plan = improve_plan(found)
