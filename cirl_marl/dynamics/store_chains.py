@@ -54,7 +54,7 @@ class StoreChains:
         pieces = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else []
         self.runs = [slice(int(piece[0]), int(piece[-1]) + 1) for piece in pieces]
         self._parts = spans(map(len, pieces))
-        self._heads, self._head_flows = _spaced(np.array(heads, dtype=np.intp)), _spaced(np.searchsorted(rows, heads))
+        self._heads, self._head_flows = _places(np.array(heads, dtype=np.intp)), _places(np.searchsorted(rows, heads))
 
     def changes(self, masses: Floats, rates: Floats, change: Floats) -> Callable[[], None]:
         """Return what writes what the stores change by, as often as it is called.
@@ -80,7 +80,7 @@ class StoreChains:
         return write
 
 
-def _spaced(places: Integers) -> Integers | slice:
+def _places(places: Integers) -> Integers | slice:
     """Return places as a slice, which is looked up sooner, if they are evenly spaced."""
     steps = set(np.diff(places).tolist())
     return slice(int(places[0]), int(places[-1]) + 1, steps.pop()) if len(steps) == 1 else places
