@@ -345,7 +345,7 @@ def test_mpc_meets_what_each_customer_orders() -> None:
     [
         (
             {"rest": ""},
-            r"'order_0', 'order_1' may order less than enters it; an arc of law 'share' has to take the rest",
+            r"controls or orders set all that leaves it; an arc of law 'share' without a control has to take the rest",
         ),
         (
             {"substances": (Substance(id="tin"),)},

@@ -259,7 +259,7 @@ LOOP = [share("m0", "m1", asking(0.0, 0.5, 1.0)), share("m0", "use"), share("m1"
         (2, LOOP, "nodes m0, m1 store nothing and can pass all they get round in a loop: the arcs that leave it need"),
         (1, [share("m0", "use", asking(0.6, 0.6, 0.7), "a"), share("m0", "use", asking(0.5, 0.5, 0.6), "b"),
              share("m0", "use")], r"node 'm0': the lowest shares of its arcs sum to 1.1, more than 1"),
-        (1, [share("m0", "use", asking(0.2, 0.6, 0.7))], "all its shares have controls; one arc without a control"),
+        (1, [share("m0", "use", asking(0.2, 0.6, 0.7))], "controls or orders set all that leaves it; an arc"),
         (1, [share("m0", "use", 0.4, "a"), share("m0", "use", 0.5, "b")], "sum to 0.9, not to 1; one may be left out"),
         (1, [share("m0", "use", None, "a"), share("m0", "use", None, "b")], "2 arcs of law 'share' state no share"),
         (1, [share("m0", "use", 1.4)], r"arc 'm0_use': share 1.4 must lie in \[0, 1\]"),

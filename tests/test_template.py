@@ -110,16 +110,13 @@ def test_an_invented_store_is_told(tmp_path: Path) -> None:
     ordered.write_text(shares.sub(rf"\1{order}", text))
     with pytest.raises(CirlError) as refused:
         load_network(ordered)
-    by = (
-        "ordered by arcs 'recycled_buildings', 'recycled_cars', 'recycled_cans'; for products with demands of their own"
-    )
-    assert str(refused.value).startswith(f"{ordered}: node 'market': it stores nothing, so that only law 'share' can")
-    assert f"{by} let it share out what is recycled" in str(refused.value) and len(str(refused.value).splitlines()) == 1
+    told = "controls or orders set all that leaves it; an arc of law 'share' without a control has to take the rest"
+    assert str(refused.value) == f"{ordered}: node 'market': {told}"
     stock = f"initial = {{ low = 90, high = 90, {SOURCE.replace('/year', '')} }}"
     head, tail = ordered.read_text().split("[nodes.market]")
     ordered.write_text(f"{head}[nodes.market]{tail.replace('stores = false', stock, 1)}")
     (told,) = [line for line in lint_warnings(load_network(ordered)) if "'market'" in line]
-    assert "take what they ask for; if it is a market: stores = false, and for products with demands" in told
+    assert "take what they ask for; if it is a market: stores = false, and a share for the rest" in told
     short = tmp_path / "short.toml"
     short.write_text(
         text.replace('makes_up_for = "demand_cans"', "").replace("neutral = 0, high = 30", "neutral = 1, high = 30")

@@ -89,7 +89,8 @@ class Split:
         rests = int(np.isnan(self.stated_shares[:, 0]).sum())
         subject = f"node '{self.donor}'"
         if not self.other_arcs:
-            yield f"{subject}: all its shares have controls; one arc without a control has to take what they leave"
+            remedy = "an arc of law 'share' without a control has to take the rest"
+            yield f"{subject}: controls or orders set all that leaves it; {remedy}"
         elif rests > 1:
             yield f"{subject}: {rests} arcs of law 'share' state no share; only one can take the rest"
         elif (low > 1 + ROUNDING).any():

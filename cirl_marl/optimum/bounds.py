@@ -285,7 +285,7 @@ def tight_bound(
 ) -> Bound:
     """Return ``bound`` by a program in which flows that may vary have constant parts: tighter, and slower."""
     admissible = Admissible.of(network)
-    levels, aims = demanded_levels(network, min_service), aims_of(network, aim, at_most)
+    levels, aims = demanded_levels(network, min_service), aims_of(network, aim, at_most, with_services=True)
     programs = Programs(admissible, DEGREE, None, steady_parts=True)
     return _solve_bound(programs, starting_stocks(admissible.lifetimes, None), None, levels, None, aims)
 

@@ -198,11 +198,11 @@ def step_program(
     cost, cost_later, spent = np.zeros(count), np.zeros(count), np.zeros((len(limits), count))
     budgets = account_shares(rates_of_budgets, dynamics)
     columns = size * np.arange(steps)[:, None] + np.arange(size)
-    part = columns[:, imbalance + 1 :]
-    effort, part_bounds = part[:, :count_efforts], slice(size - len(ledger.excesses), size)
+    convex = columns[:, imbalance + 1 :]
+    effort, part_bounds = convex[:, :count_efforts], slice(size - len(ledger.excesses), size)
     parts = np.append(efforts.controls, np.arange(controls, rates_of_accounts[2].shape[2]))
-    cost[part] = -plan.aims.objective(np.zeros(part.shape), rates_of_accounts[2][:, :, parts])
-    spent[:, part] = rates_of_budgets[2][:, :, parts]
+    cost[convex] = -plan.aims.objective(np.zeros(convex.shape), rates_of_accounts[2][:, :, parts])
+    spent[:, convex] = rates_of_budgets[2][:, :, parts]
     bounds = np.tile(np.array([0.0, np.inf]), (steps, size, 1))
     before = np.empty((len(state[0]), 0))
     rows: list[sparse.csr_array] = []
@@ -238,10 +238,10 @@ def step_program(
         rows.append(sparse.csr_array((block.data, places, block.indptr), (len(near), count)))
         rights.append(limit[near])
         measured.append(np.stack([np.full_like(near, t), near], axis=1))
-        if part.shape[1] > count_efforts:
+        if convex.shape[1] > count_efforts:
             moves = furthest[: t + 1].ravel(), efforts.half[t] * furthest[t, efforts.entries]
             block, room, bounds[t, part_bounds] = excesses.rows(t, response, before, *moves)
-            places = np.append(past, part[t])[block.indices]
+            places = np.append(past, convex[t])[block.indices]
             rows_of_parts.append(sparse.csr_array((block.data, places, block.indptr), (len(room), count)))
             rights_of_parts.append(room)
             before = response
@@ -285,7 +285,7 @@ def step_program(
     )
     net_flow = np.abs(run.flow @ imbalances)[:, None]
     largest = max(float(net_flow.max()), network.objective.circularity_scale)
-    unchanged = np.zeros(part.shape)
+    unchanged = np.zeros(convex.shape)
     origin = np.concatenate([np.zeros((steps, entries)), run.levels[0].T, net_flow, unchanged], axis=1)
     scales = [np.tile(np.append(np.ones(entries + services), largest), (steps, 1)), np.maximum(efforts.half, TINY)]
     scales.append(np.tile(ledger.amounts.T, (steps, 1)))
@@ -296,7 +296,7 @@ def step_program(
         np.concatenate([np.concatenate(scales, axis=1).ravel(), np.ones(services), size_of_excess]),
         np.concatenate([origin.ravel(), *short]),
         columns[:, :entries],
-        part,
+        convex,
         columns[:, level:imbalance],
         np.arange(size * steps, count),
         np.concatenate(measured),

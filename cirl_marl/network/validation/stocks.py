@@ -80,8 +80,6 @@ def _order_problems(
     }
     for obstacle in (obstacle for obstacle, is_there in obstacles.items() if is_there):
         yield f"{subject}: it stores nothing, and orders from it, as of {arcs}, do not go with {obstacle}"
-    if not any(arc.law is Law.SHARE for arc in outflows):
-        yield f"{subject}: {arcs} may order less than enters it; an arc of law 'share' has to take the rest"
     for arc in outflows:
         if arc.id in orders and (arc.makes_up_for or arc.capacity_node):
             field = "makes_up_for" if arc.makes_up_for else "capacity_node"
