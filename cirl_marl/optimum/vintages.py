@@ -224,6 +224,11 @@ class Lifetimes:
             low, high, from_start = write(lifetime, layout, initial, intervals)
             blocks += [outflow - high @ inflow, low @ inflow - outflow]
             limits += [from_start, -from_start]
+            if len(lifetime.rate) and lifetime.exit_arc in layout.steady_arcs:
+                steady = np.arange(len(intervals))[:, None] * layout.size + layout.steady_column(lifetime.exit_arc)
+                least = low.toarray().reshape(len(intervals), -1, low.shape[1]).min(axis=1)
+                blocks.append(sparse.csr_array(least) @ inflow - _column_sums(steady, width))
+                limits.append(-from_start.reshape(len(intervals), -1).min(axis=1))
             if self._bounds_stock(lifetime, layout):
                 stock = _column_sums(ends + self.plan_network.node_index[lifetime.node.id], width)
                 kernel = self._kernel(lifetime, layout, intervals)
@@ -231,11 +236,6 @@ class Lifetimes:
                 survivors = kernel.start_survivors @ lifetime.masses(initial)
                 blocks += [stock - sparse.csr_array(high) @ inflow, sparse.csr_array(low) @ inflow - stock]
                 limits += [survivors, -survivors]
-            if len(lifetime.rate) and lifetime.exit_arc in layout.steady_arcs:
-                steady = np.arange(len(intervals))[:, None] * layout.size + layout.steady_column(lifetime.exit_arc)
-                least = low.toarray().reshape(len(intervals), -1, low.shape[1]).min(axis=1)
-                blocks.append(sparse.csr_array(least) @ inflow - _column_sums(steady, width))
-                limits.append(-from_start.reshape(len(intervals), -1).min(axis=1))
         return sparse.vstack(blocks, format="csr"), np.concatenate(limits)
 
     def of_new(self, lifetime: WholeLifetime, layout: Layout) -> Floats:
