@@ -43,6 +43,8 @@ LOOSE = 2e-4
 """Distance of the bounds of what leaves, relative to it, above which intervals have more pieces."""
 FAR = 2.5e-3
 """The same, above which what is left is bounded too: where there are no more pieces, and lives are short."""
+MOST_PIECES = 64
+"""Of two mean lives, over which this is looked at: where they have more, a piece is short against a life."""
 
 
 @positional_record
@@ -181,16 +183,18 @@ class Lifetimes:
             turnover[self.plan_network.donors[lifetime.exit_arc]] = 0.0
         pieces = max(1, math.ceil(interval * float(turnover.max(initial=0.0)) - 1e-9))
         for lifetime in chains:
-            while not lifetime.factor.size and pieces < most and self._looseness(lifetime, pieces, degree) > LOOSE:
+            while not lifetime.factor.size and pieces < most:
+                count = pieces * self.network.episode.horizon
+                if self._looseness(lifetime, lifetime.rate.max(), count, interval / pieces, degree) <= LOOSE:
+                    break
                 pieces += 1
         return min(pieces, most)
 
-    def _looseness(self, lifetime: WholeLifetime, pieces: int, degree: int) -> float:
-        """Return how far bounds of what leaves are apart, relative to it, where as much enters all the time."""
-        rate = np.full(pieces * self.network.episode.horizon, lifetime.rate.max())
-        key = ("looseness", lifetime.node.id, float(rate[0]), pieces, degree)
-        length = self.network.episode.control_interval / pieces
-        return self.cache.value(key, lambda: Kernel(lifetime.chain, rate, length, degree).looseness)
+    def _looseness(self, lifetime: WholeLifetime, rate: float, count: int, length: float, degree: int) -> float:
+        """Return how far bounds of what leaves are apart, relative to it, where as much enters in so many pieces."""
+        key = ("looseness", lifetime.node.id, float(rate), count, length, degree)
+        rates = np.full(count, rate)
+        return self.cache.value(key, lambda: Kernel(lifetime.chain, rates, length, degree).looseness)
 
     def entries(self, layout: Layout) -> int:
         """Return how many entries the rows of an episode have, about."""
@@ -317,8 +321,16 @@ class Lifetimes:
         return self.cache.value(key, lambda: Kernel(lifetime.chain, by_piece, layout.length, layout.degree))
 
     def _bounds_stock(self, lifetime: WholeLifetime, layout: Layout) -> bool:
-        """Whether bounds of what leaves are so far apart that what is left is bounded too."""
-        return len(lifetime.rate) > 0 and self._looseness(lifetime, layout.pieces, layout.degree) > FAR
+        """Whether bounds of what leaves are so far apart that what is left is bounded too.
+
+        A life that is neither stretched nor cut decides, so that rows are the same however long lives turn out.
+        """
+        if not len(lifetime.rate):
+            return False
+        assert lifetime.node.lifetime is not None
+        mean, length = lifetime.node.lifetime.mean, layout.length
+        count = min(MOST_PIECES, math.ceil(2 * mean / length))
+        return self._looseness(lifetime, lifetime.chain.rate / mean, count, length, layout.degree) > FAR
 
     def _line_kernels(
         self, lifetime: WholeLifetime, layout: Layout, initial: Floats, intervals: range
