@@ -199,6 +199,11 @@ def short_of_flow(reason: str) -> Network:
     if reason == "capacity":
         arc = replace(order, capacity_node="plant", capacity_rate=1.0)
         return small({"store": 1e3, "sink": 0.0, "plant": 0.5}, [arc])
+    if reason == "market":
+        feed = Arc(id="feed", donor="store", recipient="market", law=Law.EXOGENOUS, flow=1.0)
+        rest = Arc(id="rest", donor="market", recipient="sink", law=Law.SHARE)
+        network, market = small({"store": 1e3, "sink": 0.0}, [order]), Node(id="market", stores=False)
+        return replace(network, nodes=(*network.nodes, market), arcs=(replace(order, donor="market"), feed, rest))
     network, *_ = of_kind("share")
     back, rest = network.arcs[1:]
     assert back.control is not None
@@ -207,7 +212,7 @@ def short_of_flow(reason: str) -> Network:
     return replace(network, arcs=(network.arcs[0], greedy, rival, rest), accounts=COST)
 
 
-@pytest.mark.parametrize("reason", ["donor", "capacity", "shares"])
+@pytest.mark.parametrize("reason", ["donor", "capacity", "market", "shares"])
 def test_flows_that_are_less_than_asked_prove_no_effort(reason: str) -> None:
     """Who asks for what is usual pays nothing, however little comes: the bound must not charge for what is missing."""
     network = short_of_flow(reason)

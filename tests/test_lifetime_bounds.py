@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from math import comb
 
 import numpy as np
@@ -35,6 +36,7 @@ from cirl_marl.optimum import bound, envelope, improve_plan, simulate_plan
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.bounds import tight_bound
 from cirl_marl.optimum.kernels import Kernel
+from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.mpc import MPC
 from cirl_marl.optimum.options import by_stage
 from cirl_marl.optimum.program import Programs
@@ -96,6 +98,49 @@ def test_kernels_enclose_what_leaves(distribution: str, deviation: float, mean: 
     elif mean > 20:
         assert (most - least).max() < 1e-4 * stock.max()
         assert (high - low).max() < (2e-3 if degree == 1 else 2e-4) * left.max()
+
+
+@pytest.mark.parametrize("mean", [3.0, 30.0])
+def test_what_is_new_counts_in_each_row_as_if_it_had_been_there(mean: float) -> None:
+    """A unit of mass at the start adds to the limits of rows what ``of_new`` says, whichever rows there are."""
+    lifetime = Lifetime(mean=mean, deviation=mean / 3, distribution="normal")
+    network = town(lifetime, INFLOW[:5], initial=30.0, growth=0.02)
+    programs = Programs(Admissible.of(network), 1, None, merge_pieces=True)
+    lifetimes, layout = programs.admissible.lifetimes, programs.layout
+    (whole,) = lifetimes.whole
+    start = by_stage(network, lifetimes.state_layout, network.initial[1])
+    more = start.copy()
+    more[whole.rows[0]] += whole.chain.inflow_shares / whole.chain.inflow_shares.sum()
+    matrix, to = lifetimes.rows(layout, start, range(5))
+    added = lifetimes.rows(layout, more, range(5))[1] - to
+    new = lifetimes.of_new(whole, layout)
+    assert new.shape == (5, matrix.shape[0])
+    np.testing.assert_allclose(new[0], added, rtol=1e-9, atol=1e-9)
+    for step in (1, 2):  # later it counts as much later, in all families of rows
+        later = lifetimes.rows(layout, more, range(step, 5))[1] - lifetimes.rows(layout, start, range(step, 5))[1]
+        places = np.concatenate([part[step:].ravel() for part in _families(matrix.shape[0], layout, 5)])
+        np.testing.assert_allclose(new[step, places], later, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("mean", [3.0, 30.0])
+def test_rows_do_not_depend_on_how_long_lives_turn_out(mean: float) -> None:
+    """Programs of draws and of windows have the same rows as the program of all that is expected."""
+    lifetime, shapes = Lifetime(mean=mean, deviation=mean / 3, distribution="normal"), set()
+    usual = town(lifetime, INFLOW[:5], initial=30.0)
+    layout = Programs(Admissible.of(usual), 1, None, merge_pieces=True).layout
+    for stretch in (0.1, 1.0, 8.0):
+        network = town(lifetime, INFLOW[:5], initial=30.0, stretch=stretch)
+        lifetimes = Programs(Admissible.of(network), 1, None, layout=layout).admissible.lifetimes
+        start = by_stage(network, lifetimes.state_layout, network.initial[1])
+        shapes.add(lifetimes.rows(layout, start, range(2))[0].shape)
+    assert len(shapes) == 1
+
+
+def _families(count: int, layout: Layout, steps: int) -> list[NDArray[np.intp]]:
+    """Return rows of each family by interval: what leaves above and below, what is left above and below."""
+    size = steps * len(layout.moments)
+    ends = [0, size, 2 * size, *((2 * size + steps * layout.pieces, count) if count > 2 * size else ())]
+    return [np.arange(a, b).reshape(steps, -1) for a, b in pairwise(ends)]
 
 
 @pytest.mark.sample(2)
