@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from batch_circularity import staged_circularity, time_window_circularity
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
@@ -22,7 +23,6 @@ from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.evaluation.figures import summary
 from cirl_marl.network import Floats
-from cirl_marl.network.batch_circularity import staged_circularity, time_window_circularity
 from cirl_marl.network.elements import REWARDS, Law
 from cirl_marl.testing.nested import same_or_raise
 

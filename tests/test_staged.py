@@ -1,14 +1,10 @@
-"""Time-window circularity of the staged formula: published figures, its integral, times that have no meaning."""
+"""Time-window circularity of the staged formula, the closed form of other tests: published figures, its integral."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
-
-from cirl_marl import CirlError
-from cirl_marl.network.batch_circularity import staged_circularity, time_window_circularity
+from batch_circularity import staged_circularity, time_window_circularity
 
 
 @pytest.mark.parametrize(
@@ -40,29 +36,3 @@ def test_time_window_is_twice_the_mean_of_the_stages() -> None:
         times = {"use": use, "sorting_time": sorting, "truck": truck, "incineration": incineration}
         expected = 2.0 * 0.3 * mean / edges[-1]
         assert time_window_circularity([7.0], [0.3], success=success, **times) == pytest.approx(expected, rel=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"masses": [1.0, 2.0]}, "2 masses, but 1 criticalities"),
-        ({"success": 100.1}, r"success is 100\.1"),
-        ({"success": -1e-9}, "must be a percentage"),
-        ({"success": np.nan}, "must be a percentage"),
-        ({"truck": 5.1}, r"truck 5\.1"),
-        ({"use": 0.0, "truck": 0.0}, r"use 0\.0"),
-        ({"sorting_time": -1.0}, r"sorting -1\.0"),
-        ({"incineration": np.nan}, "incineration nan"),
-        ({"use": np.inf}, "use inf"),
-    ],
-)
-def test_times_without_meaning_are_refused(changes: dict[str, Any], message: str) -> None:
-    """Each by name and value, also what is no number."""
-    usual: dict[str, Any] = {"masses": [1.0], "criticality": [0.5], "success": 50.0}
-    usual |= {"use": 5.0, "sorting_time": 1.0, "truck": 2.0, "incineration": 1.0}
-    assert time_window_circularity(**usual) < 0.0
-    with pytest.raises(CirlError, match=message):
-        time_window_circularity(**(usual | changes))
-    if "success" in changes:
-        with pytest.raises(CirlError, match=message):
-            staged_circularity([1.0], mass=7.0, departure=0.0, truck_arrival=3.0, use_end=6.0, **changes)

@@ -13,8 +13,7 @@ import numpy as np
 from cirl_marl.controllers.indicators import indicators
 from cirl_marl.controllers.rollout import EpisodeStart, Rollout
 from cirl_marl.dynamics.laws import LAWS
-from cirl_marl.network import Network
-from cirl_marl.network.batch_circularity import CIRO_FACTOR
+from cirl_marl.network import Floats, Network
 from cirl_marl.network.calendar import labels
 from cirl_marl.network.elements import Arc
 
@@ -27,10 +26,10 @@ def outcome_lines(network: Network, run: Rollout, origin: EpisodeStart) -> list[
 
     A network that states the criticality of its material has its time-window circularity as well.
     """
-    criticality, circularity = network.objective.criticality, float(run.episode_circularity[0])
+    circularity = float(run.episode_circularity[0])
     figures = [f"λ̄ = {circularity:.5g} {network.mass_unit}", f"service level {float(run.episode_service[0]):.4f}"]
-    if criticality is not None:
-        figures.append(f"time-window circularity {CIRO_FACTOR * criticality * circularity:.5g} {network.mass_unit}")
+    if (of_window := time_window(network, run)) is not None:
+        figures.append(f"time-window circularity {of_window[0]:.5g} {network.mass_unit}")
     lines = [f"start: {origin.description}", ", ".join(figures)]
     if len(network.services) > 1:
         levels = zip(network.services, run.episode_levels[0].tolist(), strict=True)
@@ -39,6 +38,15 @@ def outcome_lines(network: Network, run: Rollout, origin: EpisodeStart) -> list[
         lines.append(f"accounts: {totals_text(network, run)}")
     found = indicators(network, run.flow.mean(axis=0))
     return [*lines, *([found.text(network)] if found else []), *shortage_lines(network, run)]
+
+
+def time_window(network: Network, run: Rollout) -> Floats | None:
+    """Return the time-window circularity of CIRO7.2, 2·c·λ̄ of each episode, shape (B,), mass; None without a c.
+
+    c is the criticality that the network states. That it is twice the mean of λ, the publication gives no reason for.
+    """
+    criticality = network.objective.criticality
+    return None if criticality is None else 2.0 * criticality * run.episode_circularity
 
 
 def totals_text(network: Network, run: Rollout) -> str:

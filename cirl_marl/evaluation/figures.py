@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from cirl_marl.controllers.indicators import indicators
+from cirl_marl.controllers.outcome import time_window
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.definitions.writer import fingerprint
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.evaluation.statistics import SHARE, Aggregate, over_episodes, worst_mean
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.batch_circularity import CIRO_FACTOR
 from cirl_marl.optimum.bounds import relative
 from cirl_marl.records.machine import versions
 
@@ -26,15 +26,6 @@ def gain(rollout_: Rollout, neutral: Rollout) -> Floats:
     """Return the circularity gain (λ̄ − λ̄_neutral)/|λ̄_neutral| of each episode, shape (B,); NaN where λ̄_neutral = 0."""
     reference = neutral.episode_circularity
     return relative(rollout_.episode_circularity - reference, reference)
-
-
-def time_window(network: Network, rollout_: Rollout) -> Floats:
-    """Return 2·c·λ̄ of each episode, shape (B,), mass; c is the criticality that the network states.
-
-    It is the time-window circularity of CIRO7.2: see ``staged.time_window_circularity``.
-    """
-    assert network.objective.criticality is not None
-    return CIRO_FACTOR * network.objective.criticality * rollout_.episode_circularity
 
 
 def summary(env: MultiAgentVectorEnv, rollouts: Mapping[str, Rollout]) -> dict[str, Any]:
@@ -64,8 +55,8 @@ def summary(env: MultiAgentVectorEnv, rollouts: Mapping[str, Rollout]) -> dict[s
             figures[name]["accounts"] = {account.id: over_episodes(row).as_dict() for account, row in totals}
         if found := indicators(env.network, run.mean_flow):
             figures[name]["indicators"] = asdict(found)
-        if env.network.objective.criticality is not None:
-            figures[name]["time_window_circularity"] = over_episodes(time_window(env.network, run)).as_dict()
+        if (of_window := time_window(env.network, run)) is not None:
+            figures[name]["time_window_circularity"] = over_episodes(of_window).as_dict()
     return {"unit": env.network.mass_unit, "episodes": env.num_envs, "controllers": figures}
 
 

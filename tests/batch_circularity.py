@@ -7,11 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats
-
-CIRO_FACTOR = 2.0
-"""The published time-window circularity is twice the mean of λ over the window; the publication gives no reason."""
 
 
 def staged_circularity(
@@ -30,15 +26,11 @@ def staged_circularity(
         truck_arrival: when m_u arrived at the incinerator, t_in + T_s + T_truck.
         use_end: when the sorted part did, t_in + T_s + T_second-use.
 
-    Raises:
-        CirlError: if s is no percentage.
-
     References: Zocco, Corti, Malvezzi, CiRL (arXiv 2505.21536), network N_s.
 
     >>> staged_circularity([0.0, 1.0, 5.0, 9.0], mass=10, success=80, departure=0.5, truck_arrival=4, use_end=8)
     array([ -0., -10., -12., -20.])
     """
-    _check_percentage(success)
     at = np.asarray(time, dtype=float)
     rejects = mass * (1.0 - success / 100.0)
     loss: Floats = mass * (at > departure) + rejects * (at >= truck_arrival) + (mass - rejects) * (at >= use_end)
@@ -72,9 +64,6 @@ def time_window_circularity(
         truck: T_t, time.
         incineration: T_i that the window goes on after the last arrival, time.
 
-    Raises:
-        CirlError: if the lists differ in length, s is no percentage or the truck takes longer than second use.
-
     References: released code of CIRO7.2 (``compute_lambda.py``), by Zocco et al.
 
     >>> day, month = 86_400.0, 2_592_000.0
@@ -82,18 +71,7 @@ def time_window_circularity(
     >>> round(time_window_circularity([5, 2], [0.1, 0.95], success=0, **times), 3)
     -7.197
     """
-    if len(masses) != len(criticality):
-        raise CirlError(f"{len(masses)} masses, but {len(criticality)} criticalities")
-    _check_percentage(success)
-    finite = all(0.0 <= time < np.inf for time in (use, sorting_time, truck, incineration))
-    if not finite or truck > use or use == 0.0:
-        raise CirlError(f"times use {use!r}, sorting {sorting_time!r}, truck {truck!r}, incineration {incineration!r}")
     critical_mass = float(np.dot(masses, criticality))
     window = use + sorting_time + use + incineration
     stages = (use + sorting_time + truck) + (2.0 - success / 100.0) * (use - truck) + 2.0 * incineration
-    return -CIRO_FACTOR * critical_mass * stages / window
-
-
-def _check_percentage(success: float) -> None:
-    if not 0.0 <= success <= 100.0:
-        raise CirlError(f"success is {success!r}; it must be a percentage")
+    return -2.0 * critical_mass * stages / window
