@@ -2,7 +2,7 @@
 
     python tests/imports.py [CHECKOUT]
 
-Every import counts, those inside functions and under ``TYPE_CHECKING`` too. A *room* is a sub-package of
+Every import counts, those inside functions, under ``TYPE_CHECKING`` and in stubs too. A *room* is a sub-package of
 ``cirl_marl`` or a module at its top; a room stands one floor above the highest of those that it imports.
 """
 
@@ -46,7 +46,8 @@ def arrows(files: Mapping[str, Path]) -> nx.DiGraph:
     graph = nx.DiGraph()
     graph.add_nodes_from(files)
     for module, path in files.items():
-        graph.add_edges_from((module, other) for other in imported(path.read_text(encoding="utf-8"), files))
+        for file in filter(Path.is_file, (path, path.with_suffix(".pyi"))):
+            graph.add_edges_from((module, other) for other in imported(file.read_text(encoding="utf-8"), files))
     return graph
 
 
