@@ -12,17 +12,20 @@ import hashlib
 import sys
 from pathlib import Path
 
+import numpy as np
 import tomlkit
 
 from benchmarks.document import made_with, markdown_table, write_sections
 from benchmarks.foresight import proof
 from benchmarks.uncertain import WORLDS
-from cirl_marl.optimum import Sampling, bound
+from cirl_marl.network import Network
+from cirl_marl.optimum import Sampling, UncertainBound, bound
+from cirl_marl.optimum.options import demanded_levels
 from cirl_marl.records.files import write_atomically
 from cirl_marl.report.benchmark_tables import TABLES, save_profiles
 from cirl_marl.suite.held_out import VARIANTS
 from cirl_marl.suite.result_rows import read_rows
-from cirl_marl.suite.task_bounds import TaskBound, of_draws, prove
+from cirl_marl.suite.task_bounds import TaskBound, starts_of, values_at
 from cirl_marl.suite.tasks import (
     CONTROLLERS,
     DECLARATION,
@@ -42,6 +45,42 @@ SECTIONS = {
     "transfer": "transfer",
 }
 """Marks of the document, and tables by their titles."""
+
+
+def prove(network: Network, episodes: int, seed: int, min_service: float) -> TaskBound:
+    """Bound a network whose future is known, for the starts of an evaluation, by one program at their mean.
+
+    Raises:
+        CirlError: for a service out of reach, or a network for which nothing is proved.
+    """
+    starts = starts_of(network, episodes, seed)
+    solution = bound(network, starts.mean(axis=0), min_service=min_service)
+    demand = demanded_levels(solution.network, min_service)
+    values = values_at(network, starts, solution.certificate, demand)
+    # the last rows of the program demand the services; of them μ are the multipliers
+    prices = -np.minimum(solution.certificate.under[-len(demand) :], 0.0) if len(demand) else np.zeros(0)
+    return TaskBound(
+        values=values,
+        prices=prices,
+        demand=demand,
+        scale=abs(float(values.mean())),
+        half_width=0.0,
+        equal=solution.certificate.equal,
+        under=solution.certificate.under,
+    )
+
+
+def of_draws(proof: UncertainBound) -> TaskBound:
+    """Return what is needed of a bound for who does not foresee."""
+    return TaskBound(
+        values=proof.values,
+        prices=proof.prices.service,
+        demand=proof.prices.demand,
+        scale=proof.scale,
+        half_width=proof.half_width,
+        equal=np.zeros(0),
+        under=np.zeros(0),
+    )
 
 
 def proved(task: BenchmarkTask) -> TaskBound:

@@ -15,11 +15,9 @@ from cirl_marl.errors import RunError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import frozen_record
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.bounds import bound
 from cirl_marl.optimum.certificate import Certificate, verify
-from cirl_marl.optimum.options import DEGREE, demanded_levels
+from cirl_marl.optimum.options import DEGREE
 from cirl_marl.optimum.program import Programs
-from cirl_marl.optimum.uncertain_bound import UncertainBound
 from cirl_marl.records.files import write_atomically
 
 
@@ -81,43 +79,7 @@ class TaskBound:
         if not len(self.equal):
             raise RunError(f"network '{network.name}': each draw of its bound has multipliers, which are not kept")
         starts = starts_of(network, len(self.values), seed)
-        return _values_at(network, starts, Certificate(equal=self.equal, under=self.under), self.demand)
-
-
-def prove(network: Network, episodes: int, seed: int, min_service: float) -> TaskBound:
-    """Bound a network whose future is known, for the starts of an evaluation, by one program at their mean.
-
-    Raises:
-        CirlError: for a service out of reach, or a network for which nothing is proved.
-    """
-    starts = starts_of(network, episodes, seed)
-    solution = bound(network, starts.mean(axis=0), min_service=min_service)
-    demand = demanded_levels(solution.network, min_service)
-    values = _values_at(network, starts, solution.certificate, demand)
-    # the last rows of the program demand the services; of them μ are the multipliers
-    prices = -np.minimum(solution.certificate.under[-len(demand) :], 0.0) if len(demand) else np.zeros(0)
-    return TaskBound(
-        values=values,
-        prices=prices,
-        demand=demand,
-        scale=abs(float(values.mean())),
-        half_width=0.0,
-        equal=solution.certificate.equal,
-        under=solution.certificate.under,
-    )
-
-
-def of_draws(proof: UncertainBound) -> TaskBound:
-    """Return what is needed of a bound for who does not foresee."""
-    return TaskBound(
-        values=proof.values,
-        prices=proof.prices.service,
-        demand=proof.prices.demand,
-        scale=proof.scale,
-        half_width=proof.half_width,
-        equal=np.zeros(0),
-        under=np.zeros(0),
-    )
+        return values_at(network, starts, Certificate(equal=self.equal, under=self.under), self.demand)
 
 
 def starts_of(network: Network, episodes: int, seed: int) -> Floats:
@@ -127,7 +89,8 @@ def starts_of(network: Network, episodes: int, seed: int) -> Floats:
     return env.physical.stock[env.rows.nodes].T.copy()
 
 
-def _values_at(network: Network, starts: Floats, certificate: Certificate, demand: Floats) -> Floats:
+def values_at(network: Network, starts: Floats, certificate: Certificate, demand: Floats) -> Floats:
+    """Return what multipliers prove of episodes from some starts, shape (episodes,), mass."""
     programs = Programs(Admissible.of(network, None), DEGREE, None)
     problems = (programs.program(start, demand if len(demand) else None) for start in starts)
     return np.array([verify(problem, certificate, np.zeros(len(problem.cost))).bound for problem in problems])
