@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Sequence
+from importlib import import_module
 from numbers import Integral
+from typing import Any
 
 LONGEST_LINE = 1200
 """Characters of a line of a message; of a longer one, which repeats what is in a file, the middle is left out."""
@@ -74,6 +76,14 @@ def whole_number(name: str, value: object, least: int) -> int:
     if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
         raise CirlError(f"{name} must be a whole number of at least {least}, got {value!r}")
     return int(value)
+
+
+def optional_module(name: str, need: str, extra: str) -> Any:
+    """Return a module that an extra of this package installs; a ``CirlError`` says what needs it, and how to get it."""
+    try:
+        return import_module(name)
+    except ImportError as missing:
+        raise CirlError(f"{need}: pip install 'cirl-marl[{extra}]'") from missing
 
 
 def unknown_name(kind: str, name: object, known_names: Iterable[object]) -> str:

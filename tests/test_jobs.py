@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from written_jobs import written
 
+from cirl_marl import errors
 from cirl_marl.definitions.code_permission import code_allowed
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.jobs import JobStatus, driver, places, raise_first, run_jobs
@@ -224,11 +225,7 @@ def test_places_that_cannot_be(
     options: dict[str, object], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing is begun, and the words say what to do."""
-
-    def missing(package: str) -> None:
-        raise ModuleNotFoundError(package, name=package)
-
-    monkeypatch.setattr(places, "import_module", missing)
+    monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(CirlError, match=message):
         run_jobs(written(tmp_path), tmp_path / "jobs", **options)  # type: ignore[arg-type]
     assert list(tmp_path.iterdir()) == []
@@ -238,7 +235,7 @@ def test_logs_of_a_node_that_dies_are_left_out(monkeypatch: pytest.MonkeyPatch) 
     """What Ray prints of one is that it is dead, unless the user wants it otherwise."""
     seen: list[str] = []
     key = "RAY_DEDUP_LOGS_SKIP_REGEX"
-    monkeypatch.setattr(places, "import_module", lambda name: seen.append(os.environ[key]))
+    monkeypatch.setattr(errors, "import_module", lambda name: seen.append(os.environ[key]))
     monkeypatch.setenv(key, "mine")
     places.check_place("ray")
     monkeypatch.delenv(key)

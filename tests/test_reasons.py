@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +26,6 @@ from cirl_marl.learners.interface import Trained, train
 from cirl_marl.learners.policies import DifferentiablePolicy, Policies, Policy
 from cirl_marl.learners.recipe import LearnerSettings, Normalisation, Recipe, Run
 from cirl_marl.learners.views import OneAgent
-from cirl_marl.reasons import extras
 from cirl_marl.reasons.attribution import _memories, attribute_inputs
 from cirl_marl.reasons.explanation import explain
 from cirl_marl.reasons.input_signals import policy_columns, signal_of
@@ -255,12 +255,8 @@ def test_bad_questions_about_a_run(copper_run: Path, monkeypatch: pytest.MonkeyP
         explain(copper_run, episodes=1)
     with pytest.raises(CirlError, match="a run has its own"):
         explain(copper_run, scenario="paper")
-
-    def missing(name: str) -> Any:
-        raise ImportError(name)
-
-    monkeypatch.setattr(extras, "import_module", missing)
-    with pytest.raises(CirlError, match=r"need captum: python -m pip install \"cirl-marl\[explain\]\""):
+    monkeypatch.setitem(sys.modules, "captum.attr", None)
+    with pytest.raises(CirlError, match=r"need captum: pip install 'cirl-marl\[explain\]'"):
         explain(copper_run)
 
 

@@ -6,6 +6,7 @@ import os
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -16,7 +17,7 @@ from cirl_marl.drawing.content_colours import SubstanceAmounts
 from cirl_marl.drawing.folding import fold_copies
 from cirl_marl.drawing.picture import draw_network, largest_flow, legend_of
 from cirl_marl.drawing.style import number, readable, save
-from cirl_marl.errors import CirlError
+from cirl_marl.errors import optional_module
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.calendar import labels
 
@@ -32,15 +33,9 @@ class Window:
     def __init__(self, caption: str) -> None:
         """Check that pygame is there; a ``CirlError`` if not."""
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # pygame greets on stdout otherwise
-        try:
-            import pygame
-        except ImportError as missing:
-            raise CirlError(
-                "render_mode 'human' needs pygame: install the extra, pip install 'cirl-marl[human]'"
-            ) from missing
-        self._pygame = pygame
+        self._pygame = optional_module("pygame", "render_mode 'human' needs pygame", "human")
         self._caption = caption
-        self._screen: pygame.Surface | None = None
+        self._screen: Any = None
 
     def show(self, image: NDArray[np.uint8]) -> None:
         """Show an image, shape (height, width, 3)."""

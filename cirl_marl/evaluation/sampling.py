@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib import import_module
-from types import ModuleType
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 
 from cirl_marl.controllers.rollout import episode_start, first_seed, rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError
+from cirl_marl.errors import CirlError, optional_module
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.registry import named_controller
@@ -89,13 +87,9 @@ def sample_episodes(
     return SampledEpisodes(network, tuple(network.uncertain), factors, *figures, stock, flow, run.disturbances)
 
 
-def rbd_fast() -> ModuleType:
+def rbd_fast() -> Any:
     """Return ``SALib.analyze.rbd_fast``; a ``CirlError`` says what to install."""
-    try:
-        return import_module("SALib.analyze.rbd_fast")
-    except ImportError as missing:
-        advice = 'python -m pip install "cirl-marl[sensitivity]"'
-        raise CirlError(f"which uncertain number matters is told by SALib: {advice}") from missing
+    return optional_module("SALib.analyze.rbd_fast", "which uncertain number matters is told by SALib", "sensitivity")
 
 
 def sensitivities(episodes: SampledEpisodes) -> list[Sensitivity]:

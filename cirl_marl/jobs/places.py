@@ -7,13 +7,12 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from importlib import import_module
 from multiprocessing import get_context, parent_process
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, Protocol
 
-from cirl_marl.errors import CirlError, unknown_name, whole_number
+from cirl_marl.errors import CirlError, optional_module, unknown_name, whole_number
 from cirl_marl.jobs.slurm import Slurm, sbatch_options, settings_text
 from cirl_marl.jobs.work import Work, text_lines
 
@@ -173,14 +172,7 @@ def _address() -> str:
 def _ray() -> Any:
     """Import Ray, or say that it is missing; the logs of a node that dies are left out of what it prints."""
     os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", "Raylet is terminated")  # read when it is imported
-    try:
-        return import_module("ray")
-    except ModuleNotFoundError as error:
-        if error.name != "ray":
-            raise
-        raise CirlError(
-            "--on ray needs the package ray, which is not installed: pip install 'cirl-marl[ray]'"
-        ) from None
+    return optional_module("ray", "--on ray needs the package ray, which is not installed", "ray")
 
 
 def _last_line(error: BaseException) -> str:

@@ -16,10 +16,10 @@ import numpy as np
 
 from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
+from cirl_marl.errors import optional_module
 from cirl_marl.evaluation.statistics import Aggregate, over_episodes
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import frozen_record
-from cirl_marl.reasons.extras import module_for
 from cirl_marl.reasons.input_signals import Signal, observation_entries, policy_columns, signal_of
 from cirl_marl.reasons.interventions import FixedInputs, RecordedEpisodes, Substitution
 
@@ -60,6 +60,11 @@ class AgentInputs:
         PairedDifference | None,
         "what changed when as many of the last inputs were; None where there are no others",
     ]
+
+
+def captum() -> Any:
+    """Return ``captum.attr``; a ``CirlError`` says what to install."""
+    return optional_module("captum.attr", "explanations of policies need captum", "explain")
 
 
 def paired_difference(episodes: Rollout, usual: Rollout) -> PairedDifference:
@@ -150,7 +155,7 @@ def _integrated_gradients(
         memory = tuple(torch.as_tensor(state[sample]) for state in states)
     mean = rows.mean(axis=0, keepdims=True)
     inputs, baseline = torch.as_tensor(rows[sample]), torch.as_tensor(np.repeat(mean, len(sample), axis=0))
-    method = module_for("inputs").IntegratedGradients(function)
+    method = captum().IntegratedGradients(function)
     distance = (rows[sample] - mean)[:, [places[0] for places in columns.places]].astype(float)
     squares = (distance**2).sum(axis=0)
     sizes, slopes, residuals = np.zeros(len(columns.names)), [], []

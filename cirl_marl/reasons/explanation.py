@@ -20,11 +20,10 @@ from cirl_marl.network import Network
 from cirl_marl.network.declarations import frozen_record
 from cirl_marl.network.uncertainty import expected_network
 from cirl_marl.optimum import NoCertificate
-from cirl_marl.reasons import extras
-from cirl_marl.reasons.attribution import AgentInputs, attribute_inputs
+from cirl_marl.reasons.attribution import AgentInputs, attribute_inputs, captum
 from cirl_marl.reasons.interventions import Recorder
 from cirl_marl.reasons.prices import ShadowPrices, shadow_prices
-from cirl_marl.reasons.rules import LEAVES, TeamRules, distil_rules
+from cirl_marl.reasons.rules import LEAVES, TeamRules, distil_rules, sklearn_tree
 from cirl_marl.reasons.state_prices import StatePrices, state_prices
 
 PARTS = ("prices", "inputs", "rules")
@@ -106,9 +105,9 @@ def explain(
     for name, value, least in (("episodes", episodes, 2), ("top", top, 1), ("leaves", leaves, 2)):
         whole_number(name, value, least)
     parts = possible if parts is None else tuple(parts)
-    for part in extras.MODULES:
+    for part, module in (("inputs", captum), ("rules", sklearn_tree)):
         if part in parts:
-            extras.module_for(part)
+            module()  # or an error, before anything is played
     return _explain_run(run, parts, min_service, episodes, first_seed(seed), top, leaves, progress)
 
 

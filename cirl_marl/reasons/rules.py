@@ -18,10 +18,10 @@ import numpy as np
 from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
+from cirl_marl.errors import optional_module
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import frozen_record, positional_record
 from cirl_marl.reasons.attribution import PairedDifference, paired_difference
-from cirl_marl.reasons.extras import module_for
 from cirl_marl.reasons.input_signals import PolicyColumns, Signal, policy_columns, signal_of
 from cirl_marl.reasons.interventions import RecordedEpisodes, Recorder, Substitution
 
@@ -120,6 +120,11 @@ def _lessons(agent: str, columns: PolicyColumns, records: Sequence[RecordedEpiso
     return _Lessons(np.concatenate(features).astype(np.float32), np.concatenate(actions), np.concatenate(steps))
 
 
+def sklearn_tree() -> Any:
+    """Return ``sklearn.tree``; a ``CirlError`` says what to install."""
+    return optional_module("sklearn.tree", "explanations of policies need scikit-learn", "explain")
+
+
 def distil_rules(
     env: MultiAgentVectorEnv,
     policies: Policies,
@@ -173,7 +178,7 @@ def distil_rules(
 
 def _fit(lesson: _Lessons, leaves: int) -> Any:
     variance, actions = float(lesson.actions.var(axis=0).mean()), lesson.actions
-    tree = module_for("rules").DecisionTreeRegressor(
+    tree = sklearn_tree().DecisionTreeRegressor(
         max_leaf_nodes=max(2, leaves),
         min_samples_leaf=max(1, int(LEAF_SHARE * len(lesson.features))),
         min_impurity_decrease=max(RELATIVE_GAIN * variance, ABSOLUTE_GAIN),
