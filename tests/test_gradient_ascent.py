@@ -49,7 +49,7 @@ def test_gradients_go_through_the_policies(
 
     A share of them comes from episodes whose policies see so much of what changed.
     """
-    ascend, checked = GradientStack._ascend, []
+    ascend, checked = GradientStack._climb, []
 
     def check(stack: GradientStack, progress_remaining: float) -> None:
         tape, env, prices = stack._tape, stack._env, stack._prices.copy()
@@ -95,7 +95,7 @@ def test_gradients_go_through_the_policies(
         env.go_back(now, controls)
         checked.append(largest)
 
-    monkeypatch.setattr(GradientStack, "_ascend", check)
+    monkeypatch.setattr(GradientStack, "_climb", check)
     monkeypatch.setattr(gradient_ascent, "FEEDBACK", share)
     monkeypatch.setattr(gradient_ascent, "LARGEST_NORM", 1e9)
     asked = {"steps": 8, "evaluations": 1, "at_most": budgets, "price_rate": 0.1}

@@ -30,8 +30,8 @@ from cirl_marl.environments.state import Interval, State
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.learners.learner import Learner
 from cirl_marl.learners.recipe import Run
-from cirl_marl.learners.stacked.perceptrons import Weights, chain, write_gradients
-from cirl_marl.learners.stacked.stack import Stack
+from cirl_marl.learners.stacked.perceptrons import chain, write_gradients
+from cirl_marl.learners.stacked.stack import ActorStack
 from cirl_marl.learners.validation import QUANTILE_95, budget_levels, charges_of, first_prices, price_step
 from cirl_marl.network import Floats
 from cirl_marl.network.elements import CIRCULARITY
@@ -49,7 +49,7 @@ LEAST_PRICE = 1e-4
 """Below which no price falls, per circularity scale."""
 
 
-class GradientStack(Stack):
+class GradientStack(ActorStack):
     """All agents of one environment; critics and deviations of their policies stay as they are."""
 
     def __init__(self, members: Sequence[Learner], device: str, run: Run) -> None:
@@ -57,9 +57,6 @@ class GradientStack(Stack):
         super().__init__(members, device)
         self._env: MultiAgentVectorEnv = members[0].agent_env.views[0].env
         self._derivatives, self._run = Derivatives(self._env), run
-        self._timesteps, self._updates = self._models[0].num_timesteps, self._models[0]._n_updates
-        inputs, policies = self._inputs, [model.policy for model in self._models]
-        self._weights = Weights(policies, inputs.actor_columns, inputs.critic_columns, self._device)
         # where the entries of each agent's observation and action stand in the stacks of all
         names = [member.name for member in members]
         self._observed = [self._env.layout.slices[name] for name in names]
@@ -74,22 +71,6 @@ class GradientStack(Stack):
         self._budget_prices: tuple[Floats, Floats] = getattr(first, "budget_prices", (start, start))
         self._charges = np.array(self._env.account_charges)
 
-    def learn(self, steps: int) -> None:
-        """Learn for the share of ``steps`` that is the learners'."""
-        total = self.members[0].spec.steps_of(steps)
-        if self._timesteps >= total:
-            return
-        is_restoring = self._is_restoring
-        if not is_restoring:
-            self._current = self._inputs.begin()
-        while self._timesteps < total:
-            self._keep_progress()
-            self._arrive()
-            if is_restoring:
-                self._current, is_restoring = self._inputs.observe(update_moments=False), False
-            self._play()
-            self._ascend(1.0 - self._timesteps / total)
-
     def _keep_progress(self) -> None:
         """Leave with the first model what a resumed training needs beside it: prices, and where the episode begins."""
         first = self._models[0]
@@ -98,13 +79,9 @@ class GradientStack(Stack):
         if not self._is_restoring:
             first.episode_start = asdict(self._env.physical)
 
-    def _deterministic_actions(self, observations: Tensor, members: slice = slice(None)) -> Tensor:
-        return self._weights.actor.forward(observations[..., : self._inputs.local], members)[-1]
-
     def _give_models(self) -> None:
-        self._weights.give()
+        super()._give_models()
         for model in self._models:
-            model.num_timesteps, model._n_updates = self._timesteps, self._updates
             if (target := getattr(model, "actor_target", None)) is not None:
                 target.load_state_dict(model.actor.state_dict())
 
@@ -135,7 +112,7 @@ class GradientStack(Stack):
         env.go_back(now, controls)
         return interval
 
-    def _ascend(self, progress_remaining: float) -> None:
+    def _climb(self, progress_remaining: float) -> None:
         """Go back through the episode, and let every policy climb."""
         env, weights, length = self._env, self._weights, len(self._tape)
         count = length * env.num_envs

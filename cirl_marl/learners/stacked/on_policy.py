@@ -16,8 +16,8 @@ from stable_baselines3.common.utils import update_learning_rate
 from torch import Tensor
 
 from cirl_marl.learners.learner import Learner
-from cirl_marl.learners.stacked.perceptrons import Weights, pieces
-from cirl_marl.learners.stacked.stack import Stack
+from cirl_marl.learners.stacked.perceptrons import pieces
+from cirl_marl.learners.stacked.stack import ActorStack
 from cirl_marl.network.declarations import with_field_docs
 
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
@@ -92,17 +92,13 @@ def value_loss(values: Tensor, samples: Samples, clip: float | None) -> tuple[Te
     return error.square().mean(dim=1), gradient
 
 
-class RolloutStack(Stack):
+class RolloutStack(ActorStack):
     """PPO or A2C learners."""
 
     def __init__(self, members: Sequence[Learner], device: str = "cpu") -> None:
         """Take over parameters, optimisers, counters and streams of the learners."""
         super().__init__(members, device)
-        first = self._models[0]
-        self._rows, self._steps = members[0].agent_env.num_envs, first.n_steps
-        self._timesteps, self._updates = first.num_timesteps, first._n_updates
-        policies = [model.policy for model in self._models]
-        self._weights = Weights(policies, self._inputs.actor_columns, self._inputs.critic_columns, self._device)
+        self._rows, self._steps = members[0].agent_env.num_envs, self._models[0].n_steps
         self._acts = torch.zeros(len(members), 1, self._weights.log_std.shape[1], device=self._device)
         for mask, space in zip(self._acts, self._inputs.spaces, strict=True):
             mask[:, : space.shape[0]] = 1.0
@@ -113,34 +109,10 @@ class RolloutStack(Stack):
         self._rollout = Samples(*(torch.zeros(part, device=self._device) for part in shapes))
         self._episodes: list[deque[float]] = [deque(maxlen=EPISODES) for _ in members]
 
-    def learn(self, steps: int) -> None:
-        """Learn for the share of ``steps`` that is the learners'."""
-        first = self.members[0]
-        total = first.spec.steps_of(steps) * (self._rows // first.agent_env.copies)
-        if self._timesteps >= total:
-            return
-        is_restoring = self._is_restoring
-        if not is_restoring:
-            self._current = self._inputs.begin()
-        while self._timesteps < total:
-            self._arrive()
-            if is_restoring:
-                self._current, is_restoring = self._inputs.observe(update_moments=False), False
-            starts = np.stack([member.agent_env.last_step.dones for member in self.members])
-            self._starts = torch.as_tensor(starts, dtype=torch.float32, device=self._device)
-            self._collect()
-            self._update(1.0 - self._timesteps / total)
-
-    def _deterministic_actions(self, observations: Tensor, members: slice = slice(None)) -> Tensor:
-        return self._weights.actor.forward(observations[..., : self._inputs.local], members)[-1]
-
-    def _give_models(self) -> None:
-        self._weights.give()
-        for model in self._models:
-            model.num_timesteps, model._n_updates = self._timesteps, self._updates
-
-    def _collect(self) -> None:
+    def _play(self) -> None:
         """Fill the rollout by the policies of now."""
+        starts_now = np.stack([member.agent_env.last_step.dones for member in self.members])
+        self._starts = torch.as_tensor(starts_now, dtype=torch.float32, device=self._device)
         rollout, log_std = self._rollout, self._weights.log_std[:, None]
         rewards, starts = torch.zeros_like(rollout.values), torch.zeros_like(rollout.values)
         truncations: list[tuple[int, Tensor, Tensor]] = []  # step, rows, and the last observations of these
@@ -181,7 +153,7 @@ class RolloutStack(Stack):
             value, goes_on = rollout.values[:, :, t], 1.0 - starts[:, :, t]
         rollout.returns = rollout.advantages + rollout.values
 
-    def _update(self, progress_remaining: float) -> None:
+    def _climb(self, progress_remaining: float) -> None:
         """Pass over the samples in minibatches that each learner draws from its own stream; A2C once, over all."""
         model, weights, total = self._models[0], self._weights, self._rows * self._steps
         epochs, batch, clips = 1, total, [None, None]

@@ -22,6 +22,7 @@ from cirl_marl.learners.agent_env import wait
 from cirl_marl.learners.checkpoint import observation_statistics
 from cirl_marl.learners.learner import Learner
 from cirl_marl.learners.policies import Policies
+from cirl_marl.learners.stacked.perceptrons import Weights
 from cirl_marl.network import Integers
 
 
@@ -241,6 +242,53 @@ class Stack(ABC):
         wait()
         self._steps_done += 1
         return self._inputs.observe(update_moments=True)
+
+
+class ActorStack(Stack):
+    """Learners whose actors and critics are the perceptrons of ``Weights``: they play for a while, then climb."""
+
+    def __init__(self, members: Sequence[Learner], device: str = "cpu") -> None:
+        """Take over parameters, optimisers, counters and streams of the learners."""
+        super().__init__(members, device)
+        inputs, policies = self._inputs, [model.policy for model in self._models]
+        self._timesteps, self._updates = self._models[0].num_timesteps, self._models[0]._n_updates
+        self._weights = Weights(policies, inputs.actor_columns, inputs.critic_columns, self._device)
+
+    def learn(self, steps: int) -> None:
+        """Learn for the share of ``steps`` that is the learners'."""
+        first = self.members[0]
+        total = first.spec.steps_of(steps) * (first.agent_env.num_envs // first.agent_env.copies)
+        if self._timesteps >= total:
+            return
+        is_restoring = self._is_restoring
+        if not is_restoring:
+            self._current = self._inputs.begin()
+        while self._timesteps < total:
+            self._keep_progress()
+            self._arrive()
+            if is_restoring:
+                self._current, is_restoring = self._inputs.observe(update_moments=False), False
+            self._play()
+            self._climb(1.0 - self._timesteps / total)
+
+    def _keep_progress(self) -> None:
+        """Leave with the first model what a resumed training needs beside it."""
+
+    @abstractmethod
+    def _play(self) -> None:
+        """Act for a while, and keep what is learnt from."""
+
+    @abstractmethod
+    def _climb(self, progress_remaining: float) -> None:
+        """Move the weights by what was kept."""
+
+    def _deterministic_actions(self, observations: Tensor, members: slice = slice(None)) -> Tensor:
+        return self._weights.actor.forward(observations[..., : self._inputs.local], members)[-1]
+
+    def _give_models(self) -> None:
+        self._weights.give()
+        for model in self._models:
+            model.num_timesteps, model._n_updates = self._timesteps, self._updates
 
 
 class StackedPolicies(Policies):
