@@ -38,7 +38,7 @@ STATISTICS: Mapping[str, Statistic] = {
 """Interquartile mean of all runs; median and mean over tasks of means over seeds; what runs lack to a score of 1."""
 
 
-def aggregate(scores: ArrayLike, *, resamples: int = RESAMPLES, seed: int = 0) -> dict[str, Aggregate]:
+def aggregate(scores: ArrayLike, *, resamples: int = RESAMPLES) -> dict[str, Aggregate]:
     """Return the figures of STATISTICS by name.
 
     >>> found = aggregate([[0.0, 0.5], [0.5, 1.0]])
@@ -49,13 +49,11 @@ def aggregate(scores: ArrayLike, *, resamples: int = RESAMPLES, seed: int = 0) -
         CirlError: if scores are no table of finite numbers.
     """
     table = _table(scores)
-    samples = _resample(table, resamples, np.random.default_rng(seed))
+    samples = _resample(table, np.random.default_rng(0), resamples)
     return {name: _interval(statistic(table), statistic(samples)) for name, statistic in STATISTICS.items()}
 
 
-def probability_of_improvement(
-    scores: ArrayLike, other_scores: ArrayLike, *, resamples: int = RESAMPLES, seed: int = 0
-) -> Aggregate:
+def probability_of_improvement(scores: ArrayLike, other_scores: ArrayLike) -> Aggregate:
     """Return the probability that a run has a higher score than one of another algorithm, on a task at random.
 
     P(X > Y) + P(X = Y)/2 of all pairs of seeds (Mann and Whitney), as a mean over tasks.
@@ -69,14 +67,12 @@ def probability_of_improvement(
     first, second = _table(scores), _table(other_scores)
     if len(first) != len(second):
         raise CirlError(f"scores are of {len(first)} and of {len(second)} tasks; give the same tasks of both")
-    rng = np.random.default_rng(seed)
-    samples = _improvement(_resample(first, resamples, rng), _resample(second, resamples, rng))
+    rng = np.random.default_rng(0)
+    samples = _improvement(_resample(first, rng), _resample(second, rng))
     return _interval(_improvement(first, second), samples)
 
 
-def performance_profile(
-    scores: ArrayLike, thresholds: ArrayLike, *, resamples: int = RESAMPLES, seed: int = 0
-) -> tuple[Floats, Floats, Floats]:
+def performance_profile(scores: ArrayLike, thresholds: ArrayLike) -> tuple[Floats, Floats, Floats]:
     """Return the share of runs whose score is at least each threshold, and the ends of its interval.
 
     Each is of shape (thresholds,).
@@ -89,7 +85,7 @@ def performance_profile(
     """
     table, levels = _table(scores), np.asarray(thresholds, dtype=float)
     profile = partial(_share_above, levels)
-    samples = profile(_resample(table, resamples, np.random.default_rng(seed)))
+    samples = profile(_resample(table, np.random.default_rng(0)))
     low, high = np.quantile(samples, ENDS, axis=0)
     return profile(table), low, high
 
@@ -111,7 +107,7 @@ def _table(scores: ArrayLike) -> Floats:
     return table
 
 
-def _resample(scores: Floats, resamples: int, rng: np.random.Generator) -> Floats:
+def _resample(scores: Floats, rng: np.random.Generator, resamples: int = RESAMPLES) -> Floats:
     """Return scores with the seeds of each task drawn anew, shape (resamples, tasks, seeds)."""
     picks = rng.integers(scores.shape[1], size=(resamples, *scores.shape))
     return np.asarray(np.take_along_axis(scores[None], picks, axis=2))

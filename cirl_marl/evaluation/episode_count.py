@@ -12,15 +12,16 @@ from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.evaluation.statistics import over_episodes
 from cirl_marl.network import Network
 
+EPISODES_CERTAIN = 64
 EPISODES_DISTURBED, MOST_EPISODES = 256, 1024
 """Episodes from which on something can be said of the 5 % worst, and most to which they are doubled."""
 NEGLIGIBLE = 0.005
 """Part of |λ̄|, or of a full level, below which a difference need not be told from none."""
 
 
-def enough_episodes(network: Network, *, certain: int = 64) -> int:
-    """Return with how many episodes a comparison begins: of a disturbed network with more than of a ``certain`` one."""
-    return EPISODES_DISTURBED if network.disturbed else certain
+def enough_episodes(network: Network) -> int:
+    """Return with how many episodes a comparison begins: of a disturbed network with more than of a certain one."""
+    return EPISODES_DISTURBED if network.disturbed else EPISODES_CERTAIN
 
 
 def ties(network: Network, rollouts: Mapping[str, Sequence[Rollout]]) -> Iterator[str]:

@@ -65,7 +65,7 @@ def over_episodes(samples: Floats, within: tuple[float, float] = (-np.inf, np.in
     return Aggregate(mean, max(mean - half_width, min(low, mean)), min(mean + half_width, max(high, mean)))
 
 
-def worst_mean(samples: ArrayLike, *, resamples: int = TAIL_RESAMPLES, seed: int = 0) -> Aggregate:
+def worst_mean(samples: ArrayLike) -> Aggregate:
     """Return the mean of the worst 5 % of independent episodes (CVaR), those with the lowest figures.
 
     Of n episodes the lowest 0.05·n count, the last of them with the fraction that is left. The interval is that of the
@@ -84,7 +84,7 @@ def worst_mean(samples: ArrayLike, *, resamples: int = TAIL_RESAMPLES, seed: int
     value = float(figures @ weights)
     if count < 2:
         return Aggregate(value, float("nan"), float("nan"))
-    picks = np.random.default_rng(seed).integers(count, size=(resamples, count))
+    picks = np.random.default_rng(0).integers(count, size=(TAIL_RESAMPLES, count))
     low, high = np.quantile(np.sort(figures[picks], axis=1) @ weights, (0.025, 0.975)).tolist()
     return Aggregate(value, low, high)
 

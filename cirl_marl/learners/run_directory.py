@@ -178,10 +178,10 @@ class RunDirectory:
         return status
 
     def set_status(
-        self, state: str, joint_steps: int, checkpoint: str | None, best: dict[str, Any] | None = None, reason: str = ""
+        self, state: str, joint_steps: int, checkpoint: str | None, best: dict[str, Any] | None = None
     ) -> None:
         """Say how far the run got, and which checkpoint is the best; written atomically."""
-        status = {"state": state, "joint_steps": joint_steps, "checkpoint": checkpoint, "best": best, "reason": reason}
+        status = {"state": state, "joint_steps": joint_steps, "checkpoint": checkpoint, "best": best, "reason": ""}
         write_json(self.path / "status.json", status)
 
     def other_versions(self) -> list[str]:

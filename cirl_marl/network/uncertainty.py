@@ -420,22 +420,14 @@ def widest_splits(network: Specification, ranges: Mapping[str, tuple[float, floa
     return divisions
 
 
-def expected_network(network: Any, states: Floats | None = None, step: int = 0) -> Any:
-    """Return the certain network in which disturbances are what they are expected to be; one without them as it is.
+def expected_network(network: Any) -> Any:
+    """Return the certain network in which disturbances are what they are expected to be before anything is known.
 
-    Args:
-        network: with disturbed numbers.
-        states: of the processes in interval ``step``, shape (names,); None: before anything is known.
-        step: the interval from which on conditional means hold; before it, what is stated before anything is known.
+    A network without disturbances is returned as it is.
     """
     if not network.disturbed:
         return network
-    path = network.processes.prior_means(network.episode.horizon)
-    if states is not None:
-        column, rest = states[:, None], network.episode.horizon - step - 1
-        path[step] = network.processes.values(column, step)[:, 0]
-        path[step + 1 :] = network.processes.conditional_means(column, step, rest)[..., 0]
-    return draw_network(network, (), path)
+    return draw_network(network, (), network.processes.prior_means(network.episode.horizon))
 
 
 def _uncertain_field(network: Specification, path: str) -> tuple[Any, str]:
