@@ -20,9 +20,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from benchmarks.document import made_with, write_sections
 from cirl_marl import MultiAgentVectorEnv
-from cirl_marl.controllers.rollout import EVALUATION_SEEDS, rollout
+from cirl_marl.controllers.rollout import EVALUATION_SEEDS, rollout, starting_stocks
 from cirl_marl.errors import CirlError, unknown_name
-from cirl_marl.evaluation.comparison import starting_stocks
 from cirl_marl.optimum import (
     Bound,
     Envelope,

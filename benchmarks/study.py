@@ -24,12 +24,11 @@ from rich.progress import Progress
 
 from benchmarks.document import made_with, markdown_table, table_rows, write_sections
 from cirl_marl.controllers import LQR, Controller, Neutral
-from cirl_marl.controllers.rollout import first_seed, rollout
+from cirl_marl.controllers.rollout import first_seed, rollout, starting_stocks
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RunError, unknown_name
 from cirl_marl.evaluation import Comparison, Row, compare, solve_baseline
-from cirl_marl.evaluation.comparison import starting_stocks
 from cirl_marl.evaluation.statistics import Aggregate, over_episodes, over_seeds
 from cirl_marl.jobs import JobStatus, Tell, raise_first, run_jobs
 from cirl_marl.learners.interface import prepare, train_seeds

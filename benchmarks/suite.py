@@ -18,6 +18,8 @@ import tomlkit
 from benchmarks.document import made_with, markdown_table, write_sections
 from benchmarks.foresight import proof
 from benchmarks.uncertain import WORLDS
+from cirl_marl.controllers.rollout import first_seed, starting_stocks
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network import Network
 from cirl_marl.optimum import Sampling, UncertainBound, bound
 from cirl_marl.optimum.options import demanded_levels
@@ -25,7 +27,7 @@ from cirl_marl.records.files import write_atomically
 from cirl_marl.report.benchmark_tables import TABLES, save_profiles
 from cirl_marl.suite.held_out import VARIANTS
 from cirl_marl.suite.result_rows import read_rows
-from cirl_marl.suite.task_bounds import TaskBound, starts_of, values_at
+from cirl_marl.suite.task_bounds import TaskBound, values_at
 from cirl_marl.suite.tasks import (
     CONTROLLERS,
     DECLARATION,
@@ -53,7 +55,7 @@ def prove(network: Network, episodes: int, seed: int, min_service: float) -> Tas
     Raises:
         CirlError: for a service out of reach, or a network for which nothing is proved.
     """
-    starts = starts_of(network, episodes, seed)
+    starts = starting_stocks(MultiAgentVectorEnv(network, num_envs=episodes), first_seed(seed))
     solution = bound(network, starts.mean(axis=0), min_service=min_service)
     demand = demanded_levels(solution.network, min_service)
     values = values_at(network, starts, solution.certificate, demand)

@@ -17,8 +17,9 @@ from some import some
 import cirl_marl
 from benchmarks.suite import prove
 from cirl_marl import CirlError, Neutral, RunError, Trained, load_task, tasks
-from cirl_marl.controllers.rollout import rollout
+from cirl_marl.controllers.rollout import first_seed, rollout, starting_stocks
 from cirl_marl.definitions.ids import ids
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.learners.acting_weights import acting_weights, rebuild_run
 from cirl_marl.optimum.certificate import Certificate
 from cirl_marl.report.benchmark_tables import aggregate_cells, gap_cells, held_out_cells, save_profiles
@@ -26,7 +27,7 @@ from cirl_marl.suite import row_jobs
 from cirl_marl.suite import tasks as declared
 from cirl_marl.suite.held_out import SPREAD
 from cirl_marl.suite.result_rows import ResultRow, add_rows, is_reproduced, key_of, last_digit, read_rows, verify
-from cirl_marl.suite.task_bounds import starts_of, values_at
+from cirl_marl.suite.task_bounds import values_at
 from cirl_marl.suite.tasks import PACKAGE_DATA, algorithms, load_algorithm
 from cirl_marl.suite.weights import LARGEST_FILE, read_weights, write_weights
 
@@ -87,8 +88,8 @@ def test_certificates_prove_the_bounds() -> None:
         world.bound().recompute(world.network(), world.seed)
     # the price is the slope of what the same multipliers prove of another demand
     certificate = Certificate(equal=fresh.equal, under=fresh.under)
-    starts, less = starts_of(network, 1, task.seed), fresh.demand - [0.01, 0.0]
-    looser = values_at(network, starts, certificate, less)
+    starts = starting_stocks(MultiAgentVectorEnv(network, num_envs=1), first_seed(task.seed))
+    looser = values_at(network, starts, certificate, fresh.demand - [0.01, 0.0])
     assert looser[0] - fresh.values[0] == pytest.approx(0.01 * fresh.prices[0], rel=1e-6)
 
 

@@ -10,10 +10,9 @@ import numpy as np
 from benchmarks.peers.settings import NETWORK, SERVICE
 from benchmarks.peers.watch import Judged
 from cirl_marl import MultiAgentVectorEnv
-from cirl_marl.controllers.rollout import first_seed
+from cirl_marl.controllers.rollout import first_seed, starting_stocks
 from cirl_marl.evaluation import solve_baseline
 from cirl_marl.evaluation.baselines import Baseline
-from cirl_marl.evaluation.comparison import starting_stocks
 from cirl_marl.network import Floats
 from cirl_marl.optimum import gap
 

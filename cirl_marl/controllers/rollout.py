@@ -213,6 +213,12 @@ def episode_start(env: MultiAgentVectorEnv, seed: int | None = None) -> EpisodeS
     return EpisodeStart(first_seed(0), middle, f"the middle of all initial ranges{note}")
 
 
+def starting_stocks(env: MultiAgentVectorEnv, seed: int) -> Floats:
+    """Return the stocks in which the copies of ``env`` start, shape (copies, nodes), mass."""
+    env.reset(seed=seed)
+    return env.physical.stock[env.rows.nodes].T.copy()
+
+
 def interval_ends(network: Network) -> Floats:
     """Return the time at which each control interval of an episode ends, shape (steps,)."""
     return np.multiply(np.arange(1, network.episode.horizon + 1), network.episode.control_interval, dtype=np.float64)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cirl_marl.controllers.basic import Controller
-from cirl_marl.controllers.rollout import Rollout, first_seed, rollout
+from cirl_marl.controllers.rollout import Rollout, first_seed, rollout, starting_stocks
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, whole_number
@@ -373,12 +373,6 @@ def _play(
         episodes = len(rollouts[0].circularity)
         if not unclear or 2 * episodes > MOST_EPISODES:
             return rollouts, unclear
-
-
-def starting_stocks(env: MultiAgentVectorEnv, seed: int) -> Floats:
-    """Return the stocks in which the copies of ``env`` start, shape (copies, nodes), mass."""
-    env.reset(seed=seed)
-    return env.physical.stock[env.rows.nodes].T.copy()
 
 
 def _certain_bounds(

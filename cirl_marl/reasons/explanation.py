@@ -10,11 +10,11 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from cirl_marl.controllers.rollout import first_seed, rollout
+from cirl_marl.controllers.rollout import first_seed, rollout, starting_stocks
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError, unknown_name, whole_number
 from cirl_marl.evaluation.baselines import levels_to_demand
-from cirl_marl.evaluation.comparison import part_of, starting_stocks
+from cirl_marl.evaluation.comparison import part_of
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Network
 from cirl_marl.network.declarations import frozen_record

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cirl_marl.controllers.rollout import first_seed
+from cirl_marl.controllers.rollout import first_seed, starting_stocks
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import RunError
 from cirl_marl.network import Floats, Network
@@ -78,15 +78,8 @@ class TaskBound:
         """
         if not len(self.equal):
             raise RunError(f"network '{network.name}': each draw of its bound has multipliers, which are not kept")
-        starts = starts_of(network, len(self.values), seed)
+        starts = starting_stocks(MultiAgentVectorEnv(network, num_envs=len(self.values)), first_seed(seed))
         return values_at(network, starts, Certificate(equal=self.equal, under=self.under), self.demand)
-
-
-def starts_of(network: Network, episodes: int, seed: int) -> Floats:
-    """Return the stocks in which the episodes of an evaluation start, as programs have them, shape (episodes, rows)."""
-    env = MultiAgentVectorEnv(network, num_envs=episodes)
-    env.reset(seed=first_seed(seed))
-    return env.physical.stock[env.rows.nodes].T.copy()
 
 
 def values_at(network: Network, starts: Floats, certificate: Certificate, demand: Floats) -> Floats:
