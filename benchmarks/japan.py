@@ -19,7 +19,7 @@ from benchmarks.japan_decisions import decisions, levers_of
 from benchmarks.steel import PRIMARY, TABLE, calibrated, countries, populations, possible_network
 from cirl_marl import Levers, MultiAgentVectorEnv, levers, load_network
 from cirl_marl.controllers import Constant, Neutral
-from cirl_marl.controllers.rollout import episode_start, rollout
+from cirl_marl.controllers.rollout import episode_start
 from cirl_marl.evaluation.levers import ROUNDING
 from cirl_marl.evaluation.sampling import sample_episodes, sensitivities
 from cirl_marl.importing.flow_table import read_flows
@@ -82,7 +82,7 @@ def ranges() -> Iterator[str]:
         network = possible_network(country, everyone, level, stretch)
         env = MultiAgentVectorEnv(network, num_envs=1)
         begun = episode_start(env)
-        usual = rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
+        usual = begun.play(env, Neutral())
         demand = usual.episode_levels[0] - ROUNDING
         together = simulate_plan(improve_plan(bound(network, min_service=demand)))
         for what, planned, as_usual in savings(network, together, usual):
@@ -119,7 +119,7 @@ def trade() -> Iterator[str]:
     env = MultiAgentVectorEnv(world, num_envs=1, agents=["japan_scrap_exports"])
     begun = episode_start(env)
     controls = (Neutral(), Constant({"japan_scrap_exports": -1.0}))
-    usual, keeps = (rollout(env, each, seed=begun.seed, start=begun.initial_state) for each in controls)
+    usual, keeps = (begun.play(env, each) for each in controls)
     primary = [arc.id.endswith(PRIMARY) for arc in world.arcs]
     japan = [arc.id.startswith("japan_") for arc in world.arcs]
     saved = (usual.flow - keeps.flow).sum(axis=0) / 1e3
@@ -135,14 +135,12 @@ def lives() -> Iterator[str]:
     env = MultiAgentVectorEnv(network, num_envs=1)
     begun = episode_start(env)
     neutral = {agent: float(action[0, 0]) for agent, action in env.neutral_action.items()}
-    usual = rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
+    usual = begun.play(env, Neutral())
     yield "| a quarter longer by 2050 | λ̄, Mt/a | from as usual | lowest service |"
     yield "|-|-|-|-|"
     sectors = ("vehicles", "machinery", "construction", "other_products")
     for name, held in {**{each: (each,) for each in sectors}, "all four": sectors}.items():
-        run = rollout(
-            env, Constant({**neutral, **dict.fromkeys(held, 1.0)}), seed=begun.seed, start=begun.initial_state
-        )
+        run = begun.play(env, Constant({**neutral, **dict.fromkeys(held, 1.0)}))
         label = name if name not in network.compartments else network.compartments[name].label.lower()
         change = float(run.episode_circularity[0] - usual.episode_circularity[0])
         least = run.levels[0].mean(axis=1).min()

@@ -9,7 +9,7 @@ import numpy as np
 
 from cirl_marl import MultiAgentVectorEnv, bound, improve_plan, load_network, simulate_plan
 from cirl_marl.controllers import Constant
-from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
+from cirl_marl.controllers.rollout import Rollout, episode_start
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.series import in_intervals
 from cirl_marl.optimum import gap
@@ -102,7 +102,7 @@ def world() -> Iterator[str]:
     yield "|-|-|-|-|"
     regions = [arc.id.removesuffix("_cast") for arc in network.arcs if arc.id.endswith("_cast")]
     for name, actions in (("as usual", usual), ("all scrap is collected, little is lost", levers)):
-        run = rollout(env, Constant(actions), seed=begun.seed, start=begun.initial_state)
+        run = begun.play(env, Constant(actions))
 
         def flows(part: str, run: Rollout = run) -> Floats:
             return run.flow[:, [network.arc_index[f"{region}_{part}"] for region in regions]]

@@ -20,7 +20,7 @@ from benchmarks.document import markdown_table, write_sections
 from benchmarks.plans import CYCLES
 from benchmarks.yearly import yearly_network
 from cirl_marl import MPC, MultiAgentVectorEnv, Network, load_network
-from cirl_marl.controllers.rollout import episode_start, rollout
+from cirl_marl.controllers.rollout import episode_start
 from cirl_marl.optimum import bound, gap
 
 NAMES = ("steel_japan", *CYCLES)
@@ -64,7 +64,7 @@ def outcomes(name: str) -> Iterator[Outcome]:
         env = MultiAgentVectorEnv(network, num_envs=1)
         begun, start = episode_start(env), time.process_time()
         controller = MPC(horizon=window, min_service=demanded)
-        run = rollout(env, controller, seed=begun.seed, start=begun.initial_state)
+        run = begun.play(env, controller)
         seconds = time.process_time() - start
         if controller.note:
             typer.echo(f"{name}, {_span(window)}: {controller.note}", err=True)

@@ -12,7 +12,7 @@ from pathlib import Path
 from benchmarks.document import write_sections
 from cirl_marl import CirlError, MultiAgentVectorEnv, Network, load_network
 from cirl_marl.controllers import Neutral
-from cirl_marl.controllers.rollout import episode_start, rollout
+from cirl_marl.controllers.rollout import episode_start
 from cirl_marl.optimum import bound, gap, improve_plan, simulate_plan
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "cycles.md"
@@ -25,7 +25,7 @@ def plan_lines(what: str, networks: Mapping[str, Network], *, unit: float = 1.0)
     yield "|-|-|-|-|-|-|-|"
     for name, network in networks.items():
         begun = episode_start(MultiAgentVectorEnv(network, num_envs=1))
-        usual = rollout(MultiAgentVectorEnv(network, num_envs=1), Neutral(), seed=begun.seed, start=begun.initial_state)
+        usual = begun.play(MultiAgentVectorEnv(network, num_envs=1), Neutral())
         usual_said = f"{usual.episode_circularity[0] / unit:.2f}"
         begin = time.process_time()
         try:

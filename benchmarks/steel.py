@@ -24,7 +24,7 @@ from benchmarks.plans import DOCUMENT as CYCLES
 from benchmarks.steel_calibration import Posterior, calibrate, inflow_of
 from cirl_marl import MultiAgentVectorEnv, load_network
 from cirl_marl.controllers import Neutral
-from cirl_marl.controllers.rollout import episode_start, rollout
+from cirl_marl.controllers.rollout import episode_start
 from cirl_marl.importing.definition import identifiers, shares_of
 from cirl_marl.importing.flow_table import FlowTable, read_flows
 from cirl_marl.network import Floats, Network
@@ -450,7 +450,7 @@ def simulated(region: str, scenario: str, folder: Path = ENVS) -> tuple[dict[str
     network = load_network(f"{folder / 'steel.toml'}:{region}", scenario=scenario)
     env = MultiAgentVectorEnv(network, num_envs=1)
     begun = episode_start(env)
-    run = rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
+    run = begun.play(env, Neutral())
     flows = {arc.id: run.flow[:, k] for k, arc in enumerate(network.arcs)}
     return flows, {node.id: run.stock[:, i] for i, node in enumerate(network.stores)}
 

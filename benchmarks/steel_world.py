@@ -23,7 +23,7 @@ from benchmarks.steel import ENVS, FUTURE, TABLE, YEARS, Country, countries
 from cirl_marl import MultiAgentVectorEnv, load_network
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.basic import Arrays, Controller
-from cirl_marl.controllers.rollout import episode_start, rollout
+from cirl_marl.controllers.rollout import episode_start
 from cirl_marl.importing.definition import identifiers, shares_of
 from cirl_marl.importing.flow_table import read_flows
 from cirl_marl.network import Floats, Network
@@ -125,7 +125,7 @@ def simulated(scenario: str) -> tuple[dict[str, Floats], dict[str, Floats]]:
     network = load_network(ENVS / "steel_world.toml", scenario=scenario)
     env = MultiAgentVectorEnv(network, num_envs=1)
     begun = episode_start(env)
-    run = rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
+    run = begun.play(env, Neutral())
     flows = {arc.id: run.flow[:, k] for k, arc in enumerate(network.arcs)}
     return flows, {node.id: run.stock[:, i] for i, node in enumerate(network.stores)}
 
@@ -161,7 +161,7 @@ def lever_lines() -> Iterator[str]:
     rows += [(f"all of these, in {name} alone", held([region], every)) for region, name in names.items()]
     env = MultiAgentVectorEnv(network, num_envs=len(rows))
     begun = episode_start(env)
-    run = rollout(env, _Apart([actions for _, actions in rows]), seed=begun.seed, start=begun.initial_state)
+    run = begun.play(env, _Apart([actions for _, actions in rows]))
     reached, service = run.episode_circularity / 1e3, run.levels.min(axis=(1, 2))
     gains = reached - reached[0]
     best = sorted(range(2 + len(LEVERS), len(rows)), key=lambda i: -gains[i])[:SHOWN]
@@ -200,7 +200,7 @@ def gain_lines(plan: HasPlan) -> Iterator[str]:
     neutral = env.stack(env.neutral_action)[:, 0]
     acts = np.array([[agent in part for agent in plan.agents] for part in chosen])
     parts = [_Part(network, plan.agents, plan.initial, np.where(who, plan.actions, neutral)) for who in acts]
-    run = rollout(env, Plan(parts), seed=begun.seed, start=begun.initial_state)
+    run = begun.play(env, Plan(parts))
     reached, service = run.episode_circularity / 1e3, run.episode_levels.min(axis=1)
     gains = reached - reached[0]
     yield "| who keeps to the plan | gain alone, Mt/a | lowest service | gain without them, Mt/a |"

@@ -254,7 +254,7 @@ def middle_episode(network: Network, action: float) -> Rollout:
     """Return the episode from the middle of the initial ranges in which imports are constant."""
     env = MultiAgentVectorEnv(network, num_envs=1)
     origin = episode_start(env)
-    return rollout(env, Constant({"import": action}), seed=origin.seed, start=origin.initial_state)
+    return origin.play(env, Constant({"import": action}))
 
 
 def test_nothing_is_limited_where_nothing_is_proved(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from cirl_marl import CirlError, MultiAgentVectorEnv, cli
-from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
+from cirl_marl.controllers.rollout import Rollout, episode_start
 from cirl_marl.evaluation.compared_quantities import ComparedQuantity, rank_quantities
 from cirl_marl.evaluation.simulations import Simulation, simulate_alternatives
 from cirl_marl.optimum.registry import named_controller
@@ -88,7 +88,7 @@ def alone(
     """Return what a single simulation finds."""
     env = MultiAgentVectorEnv(network, num_envs=1, scenario=scenario)
     begun = episode_start(env, seed)
-    return env, rollout(env, named_controller(control), seed=begun.seed, start=begun.initial_state)
+    return env, begun.play(env, named_controller(control))
 
 
 def figures(network: str | Path, scenario: str | None, control: str, seed: int | None) -> dict[str, float]:

@@ -36,7 +36,7 @@ from cirl_marl import (
     simulate,
     simulate_plan,
 )
-from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
+from cirl_marl.controllers.rollout import Rollout, episode_start
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network.series import Series
@@ -272,7 +272,7 @@ def controlled_by_mpc(
     env = MultiAgentVectorEnv(network, num_envs=1)
     start = episode_start(env)
     control = MPC(horizon=horizon, min_service=demanded, **options)
-    return rollout(env, control, seed=start.seed, start=start.initial_state)
+    return start.play(env, control)
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 from cirl_marl import CirlError, MultiAgentVectorEnv, load_network
 from cirl_marl.cli import app
 from cirl_marl.controllers import Neutral
-from cirl_marl.controllers.rollout import episode_start, rollout
+from cirl_marl.controllers.rollout import episode_start
 from cirl_marl.importing.assembly import ImportReport, import_flows
 from cirl_marl.importing.balances import Processes, ProcessKind, _closest
 from cirl_marl.importing.definition import identifiers, shares_of
@@ -65,7 +65,7 @@ def simulated(path: Path | str) -> dict[tuple[str, int], float]:
     network = load_network(path)
     env = MultiAgentVectorEnv(network, num_envs=1)
     begun = episode_start(env)
-    run = rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
+    run = begun.play(env, Neutral())
     start = network.episode.start
     assert isinstance(start, int | float)
     return {

@@ -11,7 +11,7 @@ import pytest
 from cirl_marl import MultiAgentVectorEnv, load_network
 from cirl_marl.controllers import Constant
 from cirl_marl.controllers.lint import lint_warnings
-from cirl_marl.controllers.rollout import episode_start, rollout
+from cirl_marl.controllers.rollout import episode_start
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "metal_cycle.toml"
 
@@ -51,9 +51,7 @@ def test_flows_of_thirty_years_against_closed_forms(action: float | None, mining
     env = MultiAgentVectorEnv(load_network(EXAMPLE), num_envs=1)
     begun = episode_start(env)
     held = {} if action is None else {"old_scrap": action}
-    run = rollout(
-        env, Constant(held if mining else held | {"smelting": -1.0}), seed=begun.seed, start=begun.initial_state
-    )
+    run = begun.play(env, Constant(held if mining else held | {"smelting": -1.0}))
     highest = np.where(np.arange(2020, 2050) < 2040, 0.5, 0.9)
     collected = {None: np.full(30, 0.5), -1.0: np.full(30, 0.3), 1.0: highest}[action]
     expected = by_hand(collected, mining)

@@ -195,7 +195,7 @@ def test_business_as_usual_is_served(network: str, everyone: list[Country]) -> N
     found = load_network(network)
     env = MultiAgentVectorEnv(found, num_envs=1)
     begun = episode_start(env)
-    run = rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
+    run = begun.play(env, Neutral())
     flow = {arc.id: run.flow[:, k] for k, arc in enumerate(found.arcs)}
     assert run.levels.min() > 1 - 1e-6
     primary = sum((flow[arc] for arc in PRIMARY), np.zeros(26))

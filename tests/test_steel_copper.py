@@ -7,7 +7,7 @@ import pytest
 
 from cirl_marl import MultiAgentVectorEnv, load_network
 from cirl_marl.controllers import Neutral
-from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
+from cirl_marl.controllers.rollout import Rollout, episode_start
 from cirl_marl.definitions.catalogue import families
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum import bound, gap, improve_plan, simulate_plan
@@ -18,7 +18,7 @@ def as_usual(name: str, scenario: str | None) -> tuple[Network, Rollout]:
     network = load_network(name, scenario=scenario)
     env = MultiAgentVectorEnv(network, num_envs=1)
     begun = episode_start(env)
-    return network, rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
+    return network, begun.play(env, Neutral())
 
 
 def content(network: Network, run: Rollout, arc: str) -> Floats:

@@ -39,7 +39,7 @@ def usual(world: Network) -> Rollout:
     """Return the episode in which nobody acts."""
     env = MultiAgentVectorEnv(world, num_envs=1)
     begun = episode_start(env)
-    return rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
+    return begun.play(env, Neutral())
 
 
 def of(network: Network, run: Rollout, arcs: Sequence[str]) -> Floats:
@@ -141,7 +141,7 @@ def test_what_stays_at_home_saves_ore_there_and_is_missed_elsewhere(world: Netwo
     env = MultiAgentVectorEnv(world, num_envs=1, agents=["japan_scrap_exports"])
     begun = episode_start(env)
 
-    run = rollout(env, Constant({"japan_scrap_exports": -1.0}), seed=begun.seed, start=begun.initial_state)
+    run = begun.play(env, Constant({"japan_scrap_exports": -1.0}))
     own = [f"japan_{arc}" for arc in PRIMARY]
     everyone_ = [arc.id for arc in world.arcs if arc.makes_up_for]
     saved = {

@@ -8,9 +8,9 @@ from functools import cache, partial
 
 import numpy as np
 
-from cirl_marl.controllers.basic import Constant, Controller, Neutral
+from cirl_marl.controllers.basic import Constant, Neutral
 from cirl_marl.controllers.outcome import NOTABLE, service_shortages, shortages
-from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
+from cirl_marl.controllers.rollout import Rollout, episode_start
 from cirl_marl.dynamics.laws import LAWS
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
@@ -45,7 +45,7 @@ def lint_warnings(network: Network, env: MultiAgentVectorEnv | None = None) -> I
     env = MultiAgentVectorEnv(network, num_envs=1) if env is None else env
     for look in (_apart, _without_effect, _shares, _departures, _free, _markets, _impure):
         yield from look(network)
-    neutral = cache(partial(_episode, env, Neutral()))
+    neutral = cache(partial(episode_start(env).play, env, Neutral()))
     yield from _short_flows(env, neutral)
     yield from _short_services(env, neutral)
     for look in (_aimless, _unpaid):
@@ -222,14 +222,14 @@ def _short_flows(env: MultiAgentVectorEnv, neutral: Callable[[], Rollout]) -> It
         return
     if network.episode.horizon > INTERVALS:
         env = MultiAgentVectorEnv(network, num_envs=1, horizon=INTERVALS)
-        neutral = partial(_episode, env, Neutral())
+        neutral = partial(episode_start(env).play, env, Neutral())
     recipients = {arc.recipient for arc in network.arcs}
     sources = {id_ for arc, donor in scheduled_donors.items() if donor not in recipients for id_ in (arc, donor)}
     highest = {agent: 1.0 for agent in network.agents if agent in sources and _scales(network, agent)}
     reported: set[str] = set()
     checks = [("neutral", neutral, set(scheduled_donors))]
     if highest:
-        checks.append(("the highest", partial(_episode, env, Constant(highest)), sources))
+        checks.append(("the highest", partial(episode_start(env).play, env, Constant(highest)), sources))
     for control, run, looked_at in checks:
         try:
             shortages_ = list(shortages(run(), env.network))
@@ -261,12 +261,6 @@ def _short_services(env: MultiAgentVectorEnv, neutral: Callable[[], Rollout]) ->
                 f"service '{service.id}': under neutral control its level is {level:.3f}, and nothing makes up for it"
             )
             yield f"{lacks}, as for others. If a market shares out to several: {OWN_DEMANDS}"
-
-
-def _episode(env: MultiAgentVectorEnv, controller: Controller) -> Rollout:
-    """Return the episode from the middle of the initial ranges."""
-    origin = episode_start(env)
-    return rollout(env, controller, seed=origin.seed, start=origin.initial_state)
 
 
 def _scales(network: Network, id_: str) -> bool:

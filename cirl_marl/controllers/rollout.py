@@ -41,6 +41,12 @@ class EpisodeStart:
         """Begin an episode in ``env`` here, and return the observations."""
         return env.reset(seed=self.seed, options={"initial_state": self.initial_state})
 
+    def play(
+        self, env: MultiAgentVectorEnv, controller: Controller, progress: Callable[[float], None] = lambda share: None
+    ) -> Rollout:
+        """Run the episode in ``env``, a single copy."""
+        return rollout(env, controller, seed=self.seed, start=self.initial_state, progress=progress)
+
 
 @positional_record
 class Rollout:

@@ -10,7 +10,7 @@ import numpy as np
 
 from cirl_marl.controllers.basic import Controller, Neutral
 from cirl_marl.controllers.outcome import outcome_lines, totals_text
-from cirl_marl.controllers.rollout import EpisodeStart, Rollout, episode_start, interval_ends, rollout
+from cirl_marl.controllers.rollout import EpisodeStart, Rollout, episode_start, interval_ends
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
@@ -83,8 +83,8 @@ def schedule(
     if env.num_envs != 1 or not env.agents:
         raise CirlError(f"network '{network.name}': a plan is of one copy in which somebody acts")
     origin = episode_start(env, seed)
-    usual = rollout(env, Neutral(), seed=origin.seed, start=origin.initial_state)
-    run = rollout(env, controller, seed=origin.seed, start=origin.initial_state, progress=progress)
+    usual = origin.play(env, Neutral())
+    run = origin.play(env, controller, progress=progress)
     values = run.controls[:, np.r_[tuple(network.control_rows[agent] for agent in env.agents)]].T
     ends = interval_ends(network)
     columns = [

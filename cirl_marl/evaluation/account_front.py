@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cirl_marl.controllers.basic import Neutral
-from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
+from cirl_marl.controllers.rollout import Rollout, episode_start
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, unknown_name, whole_number
@@ -276,8 +276,7 @@ class _Sweep:
     def front(self) -> AccountFront:
         """Return what was solved."""
         env = MultiAgentVectorEnv(self.definition, num_envs=1)
-        origin = episode_start(env)
-        as_usual = rollout(env, Neutral(), seed=origin.seed, start=origin.initial_state)
+        as_usual = episode_start(env).play(env, Neutral())
         sign = 1.0 if self._aims.account is None else -1.0
         pairs = zip(self.solutions, self.runs, strict=True)
         return AccountFront(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cirl_marl.controllers import Neutral
-from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
+from cirl_marl.controllers.rollout import Rollout, episode_start
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import MultiAgentVectorEnv
@@ -146,7 +146,8 @@ def levers(
     variant = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
     by_lever = _agents_by_lever(variant, groups or {})
     whole_number("most", most, 2)
-    usual = _as_usual(variant)
+    env = MultiAgentVectorEnv(variant, num_envs=1)
+    usual = episode_start(env).play(env, Neutral())
     demand = np.maximum(usual.episode_levels[0] - ROUNDING, 0.0) if min_service is None else min_service
     agents = {agent for group in by_lever.values() for agent in group}
     progress("plan of all levers", 0.0)
@@ -265,12 +266,6 @@ class _Trials:
     def _lacks(self, run: Rollout) -> bool:
         demand = self._plan.min_service
         return demand is not None and bool((run.episode_levels[0] < demand - SHORT).any())
-
-
-def _as_usual(network: Network) -> Rollout:
-    env = MultiAgentVectorEnv(network, num_envs=1)
-    begin = episode_start(env)
-    return rollout(env, Neutral(), seed=begin.seed, start=begin.initial_state)
 
 
 def _agents_by_lever(network: Network, groups: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:

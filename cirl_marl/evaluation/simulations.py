@@ -14,7 +14,7 @@ import numpy as np
 from cirl_marl.controllers.basic import Controller
 from cirl_marl.controllers.outcome import outcome_lines
 from cirl_marl.controllers.pyramids import pyramids
-from cirl_marl.controllers.rollout import EpisodeStart, Rollout, episode_start, interval_ends, rollout
+from cirl_marl.controllers.rollout import EpisodeStart, Rollout, episode_start, interval_ends
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Network
@@ -180,7 +180,7 @@ def simulate_alternatives(
         name = ", ".join(choice for choice, among in choices if len(among) > 1)
         origin, report = episode_start(env, seed), partial(_tell, progress, i, len(cases))
         try:
-            run = rollout(env, controller, seed=origin.seed, start=origin.initial_state, progress=report)
+            run = origin.play(env, controller, progress=report)
         except CirlError as error:
             if not name:
                 raise

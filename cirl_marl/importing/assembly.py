@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 
 from cirl_marl.controllers.basic import Neutral
-from cirl_marl.controllers.rollout import episode_start, rollout
+from cirl_marl.controllers.rollout import episode_start
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, unknown_name
@@ -277,8 +277,7 @@ def _largest_errors(
     for done, (region, id_) in enumerate(ids.items()):
         network = load_network(f"{path}:{id_}" if id_ else path)
         env = MultiAgentVectorEnv(network, num_envs=1)
-        origin = episode_start(env)
-        run = rollout(env, Neutral(), seed=origin.seed, start=origin.initial_state)
+        run = episode_start(env).play(env, Neutral())
         table_flows = flows[done]
         order = [network.arc_index[arc] for arc in definition.arcs.values()]
         errors = np.abs(run.flow[:, order] - table_flows)

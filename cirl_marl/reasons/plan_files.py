@@ -161,7 +161,7 @@ def _carry_out(network: Network, table: _Table, seed: int | None) -> PlannedEpis
     start = episode_start(env, seed)
     start.reset(env)
     initial = _stocks(env)
-    episode = rollout(env, _TableController(values), seed=start.seed, start=start.initial_state)
+    episode = start.play(env, _TableController(values))
     mass, on_file = network.mass_unit, table.column(f"mean circularity ({network.mass_unit})")
     circularity = episode.circularity_mean[0]
     if not np.allclose(circularity, on_file, rtol=ALIKE, atol=ALIKE * float(np.abs(circularity).max(initial=0.0))):
