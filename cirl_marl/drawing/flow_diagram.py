@@ -80,20 +80,15 @@ def arrange_boxes(
     most = np.array([peaks[list(ribbon.members)].sum() for ribbon in ribbons])
     donors, recipients = (np.array([getattr(r, end) for r in ribbons], dtype=np.intp) for end in ("donor", "recipient"))
     caption = LINE * (1 + max((len(label_lines(box.label, LETTERS[HORIZONTAL])) for box in boxes), default=0))
+    through = np.maximum(*(np.bincount(ends, most, len(boxes)) for ends in (donors, recipients)))
     weaves, breadths, scales = {}, {}, {}
     for way in (HORIZONTAL, VERTICAL):
-        through = _through(len(boxes), donors, recipients, most)
         widest = (WIDEST if len(boxes) <= CROWD else WIDEST_OF_MANY)[way]
         scales[way] = widest / max(float(through.max(initial=0.0)), 1e-300)
         breadths[way] = np.maximum(scales[way] * through, LEAST[way])
         whole = breadths[way] + (caption if way == HORIZONTAL else 0.0)
         weaves[way] = layered_layout(donors, recipients, scales[way] * most, whole, CLEARANCE[way], layers)
     return FlowDiagram(group, tuple(boxes), tuple(ribbons), weaves, breadths, scales, caption)
-
-
-def _through(count: int, donors: Integers, recipients: Integers, most: Floats) -> Floats:
-    """Return the most that enters or leaves each box, shape (boxes,)."""
-    return np.maximum(np.bincount(donors, most, count), np.bincount(recipients, most, count))
 
 
 def groups(network: Network) -> Mapping[str, list[int]]:

@@ -25,12 +25,8 @@ Statistic = Callable[[Floats], Floats]
 """Takes scores of shape (..., tasks, seeds), returns figures of shape (...)."""
 
 
-def _pool(scores: Floats) -> Floats:
-    return scores.reshape(*scores.shape[:-2], -1)
-
-
 STATISTICS: Mapping[str, Statistic] = {
-    "IQM": lambda scores: np.asarray(stats.trim_mean(_pool(scores), TRIM_SHARE, axis=-1)),
+    "IQM": lambda scores: np.asarray(stats.trim_mean(scores.reshape(*scores.shape[:-2], -1), TRIM_SHARE, axis=-1)),
     "median": lambda scores: np.median(scores.mean(axis=-1), axis=-1),
     "mean": lambda scores: scores.mean(axis=(-2, -1)),
     "optimality gap": lambda scores: 1.0 - np.minimum(scores, 1.0).mean(axis=(-2, -1)),

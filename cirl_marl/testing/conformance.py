@@ -64,7 +64,7 @@ def check_parallel_env(make: Callable[[], AnyEnv], *, steps: int = 200, seed: in
             break
         action_history.append(actions.sample(history[-1]))
         history.append(checked_env.step(action_history[-1], step))
-        twin = _step_copy(second, action_history[-1])
+        twin = copy.deepcopy(second.step(copy.deepcopy(dict(action_history[-1]))))
         _compare(history[-1], twin, "two environments with the same seed and actions", step)
     _check_restart(checked_env, seed, history, action_history)
     first.close()
@@ -189,10 +189,6 @@ class _CheckedEnv:
         for earlier, original, snapshot in self._recent:
             same_or_raise(snapshot, original, f"step {step}: observations returned at step {earlier} changed")
         self._recent = [*self._recent[-MEMORY_STEPS:], (step, observations, copy.deepcopy(observations))]
-
-
-def _step_copy(env: AnyEnv, actions: Mapping[Any, Any]) -> tuple[Any, ...]:
-    return copy.deepcopy(env.step(copy.deepcopy(dict(actions))))
 
 
 def _check_restart(
