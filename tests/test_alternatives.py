@@ -286,7 +286,7 @@ def test_bad_input_is_refused_before_anything_is_simulated(
     arguments: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The message names both values, or the nearest right one; nothing is written."""
-    monkeypatch.setattr("cirl_marl.evaluation.simulations.rollout", None)
+    monkeypatch.setattr("cirl_marl.controllers.rollout.rollout", None)
     assert cirl(monkeypatch, "bottles.toml", *arguments) == 2
     assert message in capsys.readouterr().err
     assert [path.name for path in Path().iterdir()] == ["bottles.toml"]

@@ -167,7 +167,7 @@ def test_what_no_file_holds_is_refused_before_anything_is_simulated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Names of files, years and titles are known before an episode is."""
-    monkeypatch.setattr("cirl_marl.evaluation.simulations.rollout", None)
+    monkeypatch.setattr("cirl_marl.controllers.rollout.rollout", None)
     (tmp_path / "file").touch()
     iamc, japan, twice = str(tmp_path / "iamc.csv"), ["steel_japan"], tmp_path / "twice.toml"
     network = load_network("steel_japan")
