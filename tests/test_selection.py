@@ -260,7 +260,7 @@ def test_what_lacks_is_named(tmp_path: Path) -> None:
     run = RunDirectory(tmp_path / "run")
     status = json.loads((run.path / "status.json").read_text())
     figures = status["best"]["figures"]
-    assert Score.from_figures(figures).figures() == figures
+    assert Score.from_dict(figures).as_dict() == figures
     assert min(figures["levels"].values()) == figures["assured"] and len(figures["levels"]) == 2
     first, second = figures["levels"]
     figures |= {"assured": 0.9, "levels": {first: 0.98, second: 0.9}}

@@ -13,7 +13,7 @@ from cirl_marl.controllers.rollout import SEED_SPACING, rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, whole_number
 from cirl_marl.network import Floats
-from cirl_marl.network.declarations import positional_record
+from cirl_marl.network.declarations import KeptRecord, positional_record
 
 FIRST_DRAW = 2**30 + 2**20
 """First seed of the draws; no evaluation has it."""
@@ -27,7 +27,7 @@ FIRST_STEP, LIMITS = 0.1, (0.03, 30.0)
 
 
 @positional_record
-class Calibration:
+class Calibration(KeptRecord):
     """A margin and what it delivers."""
 
     margin: Annotated[float, "by what is multiplied what the controller aims at"]

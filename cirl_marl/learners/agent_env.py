@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import fields
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -16,7 +15,7 @@ from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.learners.views import BatchedEnv, ObservedRows, View, by_part, rows_of
 from cirl_marl.network import Floats
-from cirl_marl.network.declarations import positional_record
+from cirl_marl.network.declarations import KeptRecord, positional_record
 from cirl_marl.network.elements import Compartment
 
 
@@ -26,7 +25,7 @@ def wait() -> None:
 
 
 @positional_record
-class StepResult:
+class StepResult(KeptRecord):
     """The outcome of a joint step for one learner, one row for each row of its view."""
 
     NAMES_IN_FILES: ClassVar = {"observation": "seen", "dones": "ended", "final_observation": "final"}
@@ -38,16 +37,6 @@ class StepResult:
     returns: Annotated[Floats | None, "sum of the rewards of the episodes that ended, anything in other rows"] = None
     lengths: Annotated[NDArray[np.integer] | None, "steps of these episodes"] = None
     truncated: Annotated[NDArray[np.bool_] | None, "rows whose episode a time limit ended; None: it ended all"] = None
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the parts by their names in files."""
-        return {self.NAMES_IN_FILES.get(part.name, part.name): getattr(self, part.name) for part in fields(self)}
-
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> StepResult:
-        """Return what ``state_dict`` was taken of."""
-        names = {key: name for name, key in cls.NAMES_IN_FILES.items()}
-        return cls(**{names.get(key, key): value for key, value in state.items()})
 
 
 _NO_STEP = StepResult(np.zeros(0), np.zeros(0, dtype=np.float32), np.zeros(0, dtype=bool))

@@ -69,7 +69,7 @@ class CheckpointBarrier:
             load()
         if self.folder is not None and self.log is None and self.write is not None:
             self.log = []
-            self.write(self.folder, {"handed": self.agent_env.last_step.state_dict(), "acting": acting_state})
+            self.write(self.folder, {"handed": self.agent_env.last_step.as_dict(), "acting": acting_state})
 
     def record(self) -> None:
         """Log the last step, if the learner has written its state."""

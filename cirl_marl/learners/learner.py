@@ -151,11 +151,11 @@ class Learner:
             self.was_in_stack = state["stacked"]
             self._first_timestep = state["model"]["values"]["_num_timesteps_at_start"]
             self.model.num_timesteps = self._first_timestep
-            steps = ((np.array(action, np.float32), StepResult.from_state(step)) for action, step in log)
+            steps = ((np.array(action, np.float32), StepResult.from_dict(step)) for action, step in log)
             self.barrier.replay_log = list(steps)
             if self.was_in_stack:
                 load()
-            last_step = StepResult.from_state(state["handed"])
+            last_step = StepResult.from_dict(state["handed"])
             self.barrier.load, self.barrier.loaded_acting_state = load_at_barrier, state["acting"]
         return self
 
@@ -200,7 +200,7 @@ class Learner:
 
     def write_journal(self, folder: Path) -> None:
         """Write the steps since the state was written: the replay log."""
-        log = [(action, step.state_dict()) for action, step in self.barrier.log or []]
+        log = [(action, step.as_dict()) for action, step in self.barrier.log or []]
         checkpoint.write_tree(folder, f"{self.name}.journal", log)
 
     def budget(self, steps: int) -> int:

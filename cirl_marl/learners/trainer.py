@@ -169,7 +169,7 @@ class Training:
             if has_tensorboard():
                 learner.log_to_tensorboard(run.path / "tensorboard" / name)
         best = run.status["best"]
-        self._best = Score.from_figures(best["figures"]) if best is not None else None
+        self._best = Score.from_dict(best["figures"]) if best is not None else None
         self._evaluations = TableFile(run.path / "evaluations.csv", EVALUATION_COLUMNS, self.done)
         if self.config.origins and self.joint_steps == 0:  # the run shall not need those from which it started
             folder = run.begin_checkpoint()
@@ -344,7 +344,7 @@ class Training:
         if better:
             self._best = score
             if self.run is not None:
-                self.run.save_best(self.joint_steps, self._write_policies, score.figures())
+                self.run.save_best(self.joint_steps, self._write_policies, score.as_dict())
         if self._evaluations is not None:
             steps = (self.joint_steps, self.joint_steps * self.config.envs)
             row = (score.circularity, score.service, score.service_bound, score.episode_return)

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import field, fields
+from dataclasses import field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,7 +22,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.learners.policies import Policies
 from cirl_marl.network import Floats
-from cirl_marl.network.declarations import positional_record
+from cirl_marl.network.declarations import KeptRecord, positional_record
 from cirl_marl.network.elements import CIRCULARITY
 from cirl_marl.optimum.aims import NO_AIMS, Aims, aims_of
 from cirl_marl.records.files import read_record, write_json
@@ -39,7 +39,7 @@ Rank = tuple[bool, float]
 
 
 @positional_record
-class Score:
+class Score(KeptRecord):
     """Figures of a validation."""
 
     NAMES_IN_FILES: ClassVar = {"service_bound": "assured", "episode_return": "paid"}
@@ -65,16 +65,6 @@ class Score:
         least = min([self.service_bound, *(min_service * share for share in shares)])
         is_served = least >= min_service
         return is_served, self.circularity if is_served else least
-
-    def figures(self) -> dict[str, Any]:
-        """Return the figures by their names in files."""
-        return {self.NAMES_IN_FILES.get(part.name, part.name): getattr(self, part.name) for part in fields(self)}
-
-    @classmethod
-    def from_figures(cls, figures: Mapping[str, Any]) -> Score:
-        """Return the score of figures that were written to a file."""
-        names = {key: name for name, key in cls.NAMES_IN_FILES.items()}
-        return cls(**{names.get(key, key): value for key, value in figures.items()})
 
 
 def validation_score(env: MultiAgentVectorEnv, policies: Policies, aims: Aims = NO_AIMS) -> Score:

@@ -18,7 +18,7 @@ from functools import cache, partial
 from itertools import chain
 from numbers import Integral, Real
 from types import MappingProxyType
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar, dataclass_transform, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeVar, dataclass_transform, get_type_hints
 
 import numpy as np
 
@@ -50,6 +50,23 @@ def frozen_record(record: type[Part]) -> type[Part]:
 def positional_record(record: type[Part]) -> type[Part]:
     """Make a dataclass as ``frozen_record`` does, whose values may be given by their places too."""
     return with_field_docs(dataclass(frozen=True, slots=True)(record))
+
+
+@dataclass(frozen=True, slots=True)
+class KeptRecord:
+    """A record that files keep, with another name there for a part in ``NAMES_IN_FILES``."""
+
+    NAMES_IN_FILES: ClassVar[Mapping[str, str]] = {}
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the parts by their names in files."""
+        return {self.NAMES_IN_FILES.get(part.name, part.name): getattr(self, part.name) for part in fields(self)}
+
+    @classmethod
+    def from_dict(cls, parts: Mapping[str, Any]) -> Self:
+        """Return the record of parts that were read from a file."""
+        names = {key: name for name, key in cls.NAMES_IN_FILES.items()}
+        return cls(**{names.get(key, key): value for key, value in parts.items()})
 
 
 def _annotations(record: Any) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -169,11 +168,7 @@ def summary_of(comparison: Comparison, **options: Any) -> dict[str, Any]:
         plain["accounts"] = {account.id: total.as_dict() for account, total in totals}
         calibration = row.entries[0].calibration
         plain["milliseconds"] = _milliseconds(row)
-        plain["calibration"] = (
-            None
-            if calibration is None
-            else {part.name: getattr(calibration, part.name) for part in fields(calibration)}
-        )
+        plain["calibration"] = None if calibration is None else calibration.as_dict()
         rows.append({"name": row.name, "seeds": list(row.seeds), **plain})
     expected = comparison.entries[0].uncertain_bound
     return {

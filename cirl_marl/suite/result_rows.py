@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from filelock import FileLock
 
 from cirl_marl.errors import CirlError, RunError, unknown_name
-from cirl_marl.network.declarations import frozen_record
+from cirl_marl.network.declarations import KeptRecord, frozen_record
 from cirl_marl.records.files import write_atomically, write_table
 from cirl_marl.suite.tasks import CONTROLLERS, PACKAGE_DATA, BenchmarkTask, Figures, load_task, tasks
 from cirl_marl.suite.weights import controller_of, sha256_of
@@ -31,7 +31,7 @@ several optima."""
 
 
 @frozen_record
-class ResultRow:
+class ResultRow(KeptRecord):
     """What a policy reached on a task."""
 
     task: str
@@ -56,10 +56,6 @@ class ResultRow:
     def id(self) -> str:
         """``TASK/ALGORITHM/SEED``, or ``TASK/ALGORITHM`` of what is not trained."""
         return "/".join([self.task, self.algorithm, *([] if self.seed is None else [str(self.seed)])])
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the cells by their columns."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @property
     def score(self) -> float:
