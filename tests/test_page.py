@@ -19,12 +19,13 @@ from pages import HOSTILE, bottles_at, shown, world
 from cirl_marl import CirlError, Network, indicators, load_network
 from cirl_marl.definitions.catalogue import families
 from cirl_marl.definitions.sources import stated_numbers
-from cirl_marl.drawing.flow_diagram import flow_diagrams, groups
+from cirl_marl.drawing.flow_diagram import Box, Ribbon, arrange_boxes, flow_diagrams, groups
 from cirl_marl.drawing.layered import NARROW, layered_layout
 from cirl_marl.errors import DefinitionError
 from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.sampling import sample_episodes
 from cirl_marl.evaluation.simulations import simulate_alternatives
+from cirl_marl.network.elements import Role
 from cirl_marl.report import page_html as html_module
 from cirl_marl.report.page_data import page_data
 from cirl_marl.report.page_html import SCRIPTS, page_html, write_page
@@ -89,6 +90,14 @@ def test_the_larger_flow_leads_forward() -> None:
     )
     assert found.layers.tolist() == [0, 1, 2, 3]
     assert [course.side != 0 for course in found.routes] == [False, False, False, True]
+
+
+def test_a_box_is_as_broad_as_the_most_that_enters_or_leaves() -> None:
+    """More leaves ``b`` than enters it."""
+    boxes = [Box(label, (place,), Role.TECHNOSPHERE, True) for place, label in enumerate("abc")]
+    diagram = arrange_boxes("", boxes, [Ribbon((0,), 0, 1), Ribbon((1,), 1, 2)], np.array([4.0, 5.0]))
+    for way, scale in diagram.scales.items():
+        np.testing.assert_allclose(diagram.breadths[way] / scale, [4.0, 5.0, 5.0], rtol=1e-12)
 
 
 @pytest.mark.medium
