@@ -26,12 +26,13 @@ from cirl_marl import (
     Series,
     Service,
     Substance,
+    gradient,
 )
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.lint import lint_warnings
 from cirl_marl.controllers.lqr import LQR
 from cirl_marl.controllers.rollout import rollout
-from cirl_marl.dynamics.krylov import Acceleration
+from cirl_marl.dynamics.krylov import Acceleration, conjugate_residuals
 from cirl_marl.environments.state import State
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Network
@@ -41,7 +42,7 @@ from cirl_marl.network.uncertainty import Spread
 from cirl_marl.optimum import bound, simulate_plan
 from cirl_marl.optimum.mpc import MPC
 
-Floats = NDArray[np.floating]
+Floats = NDArray[np.float64]
 
 
 def markets(seed: int, beside: bool = False) -> Network:
@@ -398,3 +399,74 @@ def test_a_check_tells_which_orders_are_cut() -> None:
     warnings = " ".join(lint_warnings(shop(6.0, 3.0, 6.0)))
     assert "'order_0': under neutral control 'market' gets too little for its flow from 0 year on" in warnings
     assert "gets too little" not in " ".join(lint_warnings(shop(9.0, 3.0, 6.0)))
+
+
+def test_pivots_settle_one_by_one_where_blocks_go_round() -> None:
+    """Three markets, of which two send nine tenths of what is ordered to each other, and two of what is left."""
+    inflow, demand = (2.0, 0.0, 4.0), (7.0, 8.0, 3.0)
+    nodes = [Node(id="ore", role=Role.NONRENEWABLE_RESERVOIR), Node(id="dump", role=Role.LANDFILL, initial=(0.0, 0.0))]
+    arcs: list[Arc] = []
+    for i, (enters, total) in enumerate(zip(inflow, demand, strict=True)):
+        nodes += [Node(id=name, stores=False) for name in (f"m{i}", f"ordered_{i}", f"left_{i}")]
+        arcs += [
+            Arc(id=f"in_{i}", donor="ore", recipient=f"m{i}", law=Law.EXOGENOUS, flow=enters),
+            Arc(id=f"order_{i}", donor=f"m{i}", recipient=f"ordered_{i}", law=Law.EXOGENOUS, flow=total),
+            Arc(id=f"rest_{i}", donor=f"m{i}", recipient=f"left_{i}", law=Law.SHARE),
+        ]
+        for name, others in (("ordered", {1: 2, 2: 1}), ("left", {0: 2, 2: 0})):
+            if i in others:
+                arcs.append(
+                    Arc(id=f"{name}_on_{i}", donor=f"{name}_{i}", recipient=f"m{others[i]}", law=Law.SHARE, share=0.9)
+                )
+            arcs.append(Arc(id=f"{name}_dumped_{i}", donor=f"{name}_{i}", recipient="dump", law=Law.SHARE))
+    network = Network(name="rings", nodes=tuple(nodes), arcs=tuple(arcs), episode=Episode(horizon=1), time_unit="year")
+    run = rollout(MultiAgentVectorEnv(network, num_envs=1), Neutral())
+    flow = dict(zip([arc.id for arc in arcs], run.flow[0].tolist(), strict=True))
+    for i, total in enumerate(demand):
+        through = sum(flow[arc.id] for arc in arcs if arc.recipient == f"m{i}")
+        assert flow[f"order_{i}"] == pytest.approx(min(total, through), rel=1e-12)
+        assert flow[f"rest_{i}"] == pytest.approx(max(0.0, through - total), rel=1e-12)
+
+
+def test_just_as_much_as_is_ordered_counts_as_less() -> None:
+    """What arrives more is worth what customers pay, not what the rest costs."""
+    network = shop(0.0, 3.0, 6.0, accounts=(Account(id="cost", unit="GJ"),), episode=Episode(horizon=1))
+    mine = Control(kind=ControlKind.FLOW, low=0.0, neutral=9.0, high=18.0)
+    costs = {"order_0": 3.0, "order_1": 6.0, "rest": 100.0}
+    arcs = [
+        replace(arc, law=Law.CONTROLLED, flow=0.0, control=mine)
+        if arc.id == "mine"
+        else replace(arc, accounts={"cost": costs[arc.id]})
+        for arc in network.arcs
+    ]
+    env = MultiAgentVectorEnv(replace(network, arcs=tuple(arcs)), num_envs=1)
+    env.reset(seed=0)
+    exact_gradient = gradient(env, np.zeros((1, 1, 1)), circularity=0.0, levels=[], accounts=[1.0])
+    np.testing.assert_allclose(exact_gradient.actions, 9.0 * (3.0 / 3.0 + 6.0 * 2.0 / 3.0), rtol=1e-12)
+
+
+def test_of_what_arrives_more_where_all_have_what_they_order_nothing_is_ordered() -> None:
+    """All of it goes to the rest: from there supplies estimate what arrives."""
+    dynamics = MultiAgentVectorEnv(shop(12.0, 3.0, 6.0), num_envs=1).dynamics
+    rate = dynamics.rate(dynamics.neutral[:, :1], np.zeros(1, dtype=np.intp))
+    shares = dynamics.orders.further_shares(rate)
+    assert (shares[dynamics.orders.arcs] == 0).all() and (shares[dynamics.orders.rest_arcs] == 1.0).all()
+
+
+def test_linear_systems_of_which_images_are_known_are_solved_to_round_off() -> None:
+    """Of each copy its own; where images do not reach the right-hand side there is no solution."""
+    rng, size, copies = np.random.default_rng(0), 12, 3
+    matrix, effect = np.eye(size) + 0.02 * rng.normal(size=(copies, size, size)), rng.normal(size=(copies, 4, size))
+    residual, total = rng.normal(size=(size, copies)), rng.normal(size=(4, copies))
+    solution = np.linalg.solve(matrix, residual.T[..., None])
+    exact = total - (effect @ solution)[..., 0].T
+
+    def respond(direction: Floats) -> tuple[Floats, Floats]:
+        image, further = ((part @ direction.T[..., None])[..., 0].T for part in (matrix, effect))
+        return image, further
+
+    result = conjugate_residuals(residual, total, respond)
+    assert result is not None
+    np.testing.assert_allclose(result, exact, rtol=1e-9, atol=1e-10)
+    flat = np.diag([1.0, 0.0])
+    assert conjugate_residuals(np.ones((2, 1)), np.zeros((1, 1)), lambda r: (flat @ r, r[:1])) is None

@@ -140,7 +140,7 @@ def solve(
 
     Raises:
         Infeasible: if there is no solution.
-        Unsolved: if HiGHS finds no usable answer; names the network, what was not solved, and HiGHS's status.
+        SolverFailure: if HiGHS finds no usable answer; names the network, what was not solved, and HiGHS's status.
     """
     name, answer, best, status, is_refused = problem.layout.network.name, None, math.inf, "", False
     is_large = len(problem.cost) >= LARGE_PROGRAM
