@@ -30,7 +30,7 @@ from cirl_marl.cli import app
 from cirl_marl.importing import definition
 from cirl_marl.importing.assembly import ImportReport, import_flows
 from cirl_marl.importing.flow_table import read_stocks
-from cirl_marl.importing.substance_flows import closest_amounts, degrees_of_freedom
+from cirl_marl.importing.substance_flows import closest_amounts, degrees_of_freedom, excesses
 
 LONG = ["process", "year", "substance", "value", "unit"]
 HEADER = ["source", "target", "year", "substance", "value", "unit", "uncertainty"]
@@ -322,6 +322,20 @@ def test_what_no_flow_can_hold_is_told(amounts: tuple[float, ...], deviations: t
     """Of 4 t that enter for sure no more than 3 and 0.5 t can leave; nor are 3.6 t in a flow of 3."""
     balances, flow = np.array([[1.0, -1.0, -1.0]]), np.array([100.0, 0.5, 3.0])
     assert closest_amounts(np.array([amounts]), np.array([deviations]), flow, balances) is None
+
+
+@pytest.mark.parametrize(("gap", "balances_enough"), [(1e-5, False), (1e-8, True)])
+def test_certain_amounts_balance_to_a_ten_millionth(gap: float, balances_enough: bool) -> None:
+    """Of what there is most of; nobody can change what is certain."""
+    amounts, balances = np.array([[4.0 * (1 + gap), 1.0, 3.0]]), np.array([[1.0, -1.0, -1.0]])
+    result = closest_amounts(amounts, np.zeros((1, 3)), np.full(3, 100.0), balances)
+    assert (result is not None) is balances_enough
+
+
+def test_substances_together_are_no_more_than_the_flow() -> None:
+    """Of 10 t 6 t are of one, and 5 t of another."""
+    amounts = np.array([[6.0, 6.0], [5.0, 4.0]]).reshape(2, 1, 1, 2)
+    assert [*excesses(amounts, np.full((1, 1, 2), 10.0))] == [(0, 0, 0)]
 
 
 def test_pure_substances_and_flows_of_nothing(tmp_path: Path) -> None:

@@ -151,6 +151,16 @@ def test_pivots_solve_problems_in_which_ratios_tie(seed: int) -> None:
     assert (lack[found < most] < 1e-12).all() and (lack[found > 0] > -1e-12).all()
 
 
+def test_pivots_leave_what_is_supplied_where_it_does_not_arrive() -> None:
+    """It still counts in what others lack."""
+    slope, now, most = np.array([[2.0, 0.5, 1.0], [0.0, 0.0, 0.0], [0.5, 1.0, 1.0]]), np.full(3, 4.0), np.full(3, 10.0)
+    shortage, arrives = np.array([3.0, 1.0, 1.0]), np.array([True, False, True])
+    supply = _complementary_pivots(slope, shortage, now, most, arrives)
+    lack = shortage - slope @ (supply - now)
+    assert supply[1] == 4.0
+    assert (lack[[0, 2]] <= 1e-12).all() and (lack[[0, 2]][supply[[0, 2]] > 0] >= -1e-12).all()
+
+
 def test_where_corrections_run_out_a_warning_says_so_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """It names the service, how much it is off, and what could make up for it."""
     monkeypatch.setattr(supply, "LEVELS", ((None, 0.0, 2),))

@@ -202,4 +202,4 @@ def _shortest_within(rows: Floats, least: Floats) -> Floats | None:
 
 def degrees_of_freedom(deviations: Floats, balances: Floats) -> int:
     """Return how many independent balances of substances have uncertain amounts, (substances, pairs)."""
-    return sum(int(np.linalg.matrix_rank(balances[:, row > 0])) for row in deviations if (row > 0).any())
+    return sum(int(np.linalg.matrix_rank(balances[:, row > 0])) for row in deviations)
