@@ -81,3 +81,21 @@ def test_a_multiplier_that_is_no_number_is_refused(rows: str, row: int) -> None:
     broken = replace(best, certificate=replace(best.certificate, **{rows: multipliers}))
     with pytest.raises(CirlError, match=rf"row {row}\b"):
         broken.verify()
+
+
+@pytest.mark.parametrize("size", [1e100, 1e200, 1e306, 1.7e308])
+def test_multipliers_whose_sums_overflow_prove_nothing(size: float) -> None:
+    """One of them, of either kind and sign, or all; the bound is a number that no episode exceeds, or infinite."""
+    best = bound("carbo_net", degree=1, horizon=2)
+    equal, under, reached = best.certificate.equal, best.certificate.under, best.verify().objective
+    proofs = [
+        replace(best, certificate=replace(best.certificate, equal=np.where(place == changed, sign * size, equal)))
+        for place in [np.arange(len(equal))]
+        for changed in (0, 7, place)
+        for sign in (1.0, -1.0)
+    ]
+    first = np.arange(len(under)) < 3
+    proofs.append(replace(best, certificate=replace(best.certificate, under=np.where(first, -size, under))))
+    bounds = np.array([proof.verify().bound for proof in proofs])
+    assert (bounds >= reached - 1e-9 * abs(reached)).all()
+    assert size < 1.7e308 or np.isinf(bounds).any()

@@ -43,7 +43,8 @@ def verify(problem: Program, certificate: Certificate, plan: Floats) -> Verifica
 
     since A v = b, μᵀG v ≥ μᵀg and l ≤ v ≤ u. No property of y and μ is taken on trust: those that are not optimal, or
     do not solve the dual, make a weaker bound, never a wrong one. The sums are rounded once (``math.fsum``); the
-    rounding errors of d are bounded term by term and charged against the bounds of the variables.
+    rounding errors of d are bounded term by term and charged against the bounds of the variables. Multipliers so large
+    that a sum overflows prove nothing: the bound is infinite.
 
     Args:
         problem: the program.
@@ -61,6 +62,12 @@ def verify(problem: Program, certificate: Certificate, plan: Floats) -> Verifica
         if not np.isfinite(multipliers).all():
             row = int(np.flatnonzero(~np.isfinite(multipliers))[0])
             raise CirlError(f"certificate: the multiplier of row {row} of {rows} is {multipliers[row]}")
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _verification(problem, certificate, plan)
+
+
+def _verification(problem: Program, certificate: Certificate, plan: Floats) -> Verification:
+    """Return what finite multipliers of the program prove."""
     y, mu = certificate.equal, np.minimum(certificate.under, 0.0)
     reduced_cost = problem.cost - problem.equal.T @ y - problem.under.T @ mu
     size = np.abs(problem.cost) + abs(problem.equal).T @ np.abs(y) + abs(problem.under).T @ np.abs(mu)
@@ -71,10 +78,11 @@ def verify(problem: Program, certificate: Certificate, plan: Floats) -> Verifica
     # twice what the errors can be, which leaves room for the errors of these two sums
     rounding = 2 * EPSILON * (float(terms_per_column * size @ reach) + 4 * float(np.abs(terms).sum()))
     small = np.abs(reduced_cost) < 1e-6 * np.abs(problem.cost).max(initial=0.0)
+    has_sum = math.isfinite(rounding)  # as it has all terms and their absolute sum
     return Verification(
-        bound=problem.constant - math.fsum(terms) + rounding,
+        bound=problem.constant - math.fsum(terms) + rounding if has_sum else math.inf,
         objective=problem.constant - math.fsum(problem.cost * plan),
         infeasibility=float(np.maximum(certificate.under, 0.0).max(initial=0.0)),
-        small_costs=-math.fsum(columns[small]),
-        rounding=rounding,
+        small_costs=-math.fsum(columns[small]) if has_sum else math.inf,
+        rounding=rounding if has_sum else math.inf,
     )
