@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.linalg import expm
-from scipy.special import gammainc
+from scipy.special import gammainc, gammaincc
 from test_lifetimes import INFLOW, LIVES, town
 
 from benchmarks.products import product_cycle
@@ -41,6 +41,7 @@ from cirl_marl.optimum.mpc import MPC
 from cirl_marl.optimum.options import by_stage
 from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.solver import solve
+from cirl_marl.optimum.stretched import _DiscardBounds, _survivors
 from cirl_marl.optimum.vintages import Lifetimes
 
 Floats = NDArray[np.floating]
@@ -207,6 +208,23 @@ def test_rows_hold_however_a_lifetime_is_stretched(lifetime: Lifetime, style: st
             assert (matrix @ values[first:].ravel() <= to + 1e-9 * to.max()).all()
         stretches = lifetimes.planned_stretches(layout, values, starts[0], range(years))["use"]
         np.testing.assert_allclose(stretches, 0.8 + 0.5 * (actions + 1) / 2, rtol=1e-6)
+
+
+def test_what_leaves_a_stretched_life_is_enclosed_between_cells_too() -> None:
+    """Of masses in its stages, whenever in the range it begins, and however much they turn over."""
+    rng, stages = np.random.default_rng(0), 12
+
+    def survivors(masses: Floats, turnover: Floats) -> Floats:
+        return np.asarray(masses @ gammaincc(np.arange(stages, 0, -1)[:, None], turnover))
+
+    for width in (0.0, 1e-3, 1.0) * 40:
+        masses = rng.uniform(0, 1, stages) * (rng.random(stages) < 0.5)
+        first, (least, most) = 15.0 * rng.random(), np.sort(2.0 * rng.random(2)).tolist()
+        low, high = _DiscardBounds(_survivors(masses), np.array([least, most])).within(first, first + width)
+        begin = first + width * np.linspace(0.0, 1.0, 50)
+        left = survivors(masses, begin)
+        assert low <= (left - survivors(masses, begin + least)).min()
+        assert high >= (left - survivors(masses, begin + most)).max()
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
