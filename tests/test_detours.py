@@ -20,7 +20,7 @@ from cirl_marl.dynamics.arrivals import Arrivals
 from cirl_marl.dynamics.elimination import visits
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.dynamics.static_elimination import SparseRow, StaticElimination, contract_hubs, square_matrix
-from cirl_marl.dynamics.store_chains import StoreChains
+from cirl_marl.dynamics.store_chains import SHORT, StoreChains
 from cirl_marl.errors import NetworkError
 from cirl_marl.network import RowSum
 from cirl_marl.network.elements import Lifetime, Substance
@@ -390,8 +390,8 @@ def chained(seed: int) -> Network:
 
 @given(seed=st.integers(0, 2**31))
 @settings(max_examples=15)
-def test_chains_of_stores_change_no_bit(seed: int) -> None:
-    """What moves along stages whose rates an agent sets, without and with the sparse sum."""
+def test_chains_of_stores_move_what_the_sparse_sum_does(seed: int) -> None:
+    """Stages whose rates an agent sets move along slices of rows, all of them; without, flows are the same."""
 
     def none(gives: Any, drivers: Any, flows: Any, first: int) -> StoreChains:
         return StoreChains(gives, [], [], first)
@@ -400,11 +400,49 @@ def test_chains_of_stores_change_no_bit(seed: int) -> None:
     ours = played(network, seed)
     dynamics = MultiAgentVectorEnv(network).dynamics
     assert dynamics.taylor is not None and dynamics.taylor._shortcut is not None
+    chains = dynamics.taylor._shortcut._chains
     lifetimes = [node.lifetime for node in network.stores if node.lifetime is not None and node.control is not None]
     stages = [len(lifetime.chain.inflow_shares) for lifetime in lifetimes if lifetime.chain is not None]
-    expected = sum(count - 1 for count in stages) * (1 + len(network.substances))
-    assert len(dynamics.taylor._shortcut._chains.flows) == expected
+    least = sum(count - 1 for count in stages if count > SHORT) * (1 + len(network.substances))
+    assert len(chains.flows) >= least
     with patch("cirl_marl.dynamics.taylor.StoreChains", none):
         theirs = played(network, seed)
     for one, other in zip(ours, theirs, strict=True):
-        np.testing.assert_array_equal(one, other)
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-13)
+
+
+@given(seed=st.integers(0, 2**31), stores=st.integers(1, 40), short=st.sampled_from((1, 2, 8)))
+@settings(max_examples=150)
+def test_chains_add_up_to_what_stores_change_by(seed: int, stores: int, short: int) -> None:
+    """Whatever flows where: what chains write and what is left to the sparse sum is ẋ, and no row is written twice."""
+    rng, first, copies = np.random.default_rng(seed), 1000, 3
+    drivers = rng.permutation(np.append(np.arange(stores), rng.integers(0, stores, stores // 4)))
+    drivers = drivers[rng.random(len(drivers)) < 0.9]
+    names = 100 + np.arange(len(drivers))
+    gives: dict[int, dict[int, float]] = {1: {first: 0.5}}
+    for name, row in zip(names.tolist(), drivers.tolist(), strict=True):
+        end = row + 1 if rng.random() < 0.8 else int(rng.integers(0, stores + 5))
+        weight = 1.0 if rng.random() < 0.9 else 0.7
+        gives[name] = {first + row: -1.0}
+        gives[name][first + end] = gives[name].get(first + end, 0.0) + weight
+    rate, mass = rng.uniform(0.1, 1, (len(drivers), copies)), rng.uniform(0, 9, (stores, copies))
+    flow, extent = rate * mass[drivers], stores + 5
+    whole = np.zeros((extent, copies))
+    for name, parts in gives.items():
+        for end, part in parts.items():
+            whole[end - first] += part * (flow[name - 100] if name >= 100 else 1.0)
+    with patch("cirl_marl.dynamics.store_chains.SHORT", short):
+        chains = StoreChains(gives, drivers.tolist(), names.tolist(), first)
+    change = np.full((extent, copies), np.nan)
+    rows = np.concatenate([np.arange(0), *(np.arange(run.start, run.stop) for run in chains.runs)])
+    assert len(set(rows.tolist())) == len(rows) == len(chains.flows)
+    assert all(run.stop - run.start >= short for run in chains.runs)
+    np.testing.assert_array_equal(drivers[chains.flows], rows)
+    chains.changes(mass, rate[chains.flows], change)()
+    np.testing.assert_array_equal(np.flatnonzero(np.isfinite(change).all(axis=1)), np.sort(rows))
+    change = np.nan_to_num(change)
+    for name, parts in gives.items():
+        assert parts or name == 1
+        for end, part in parts.items():
+            change[end - first] += part * (flow[name - 100] if name >= 100 else 1.0)
+    np.testing.assert_allclose(change, whole, rtol=1e-12, atol=1e-12)
