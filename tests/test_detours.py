@@ -20,7 +20,7 @@ from cirl_marl.dynamics.arrivals import Arrivals
 from cirl_marl.dynamics.elimination import visits
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.dynamics.static_elimination import SparseRow, StaticElimination, contract_hubs, square_matrix
-from cirl_marl.dynamics.store_chains import SHORT, StoreChains
+from cirl_marl.dynamics.store_chains import MANY, SHORT, StoreChains
 from cirl_marl.errors import NetworkError
 from cirl_marl.network import RowSum
 from cirl_marl.network.elements import Lifetime, Substance
@@ -65,13 +65,15 @@ def keeping(kept: Iterable[int]) -> Any:
     return patch.object(StaticElimination, "_eliminate", chosen)
 
 
-def played(network: Network, seed: int, *, short: bool = True, kept: Iterable[int] | None = None) -> list[Floats]:
-    """Return flows and stocks of an episode of random actions in two copies."""
+def played(
+    network: Network, seed: int, *, short: bool = True, kept: Iterable[int] | None = None, copies: int = 2
+) -> list[Floats]:
+    """Return flows and stocks of an episode of random actions in some copies."""
     if kept is None:
-        env = MultiAgentVectorEnv(network, num_envs=2)
+        env = MultiAgentVectorEnv(network, num_envs=copies)
     else:
         with keeping(kept):
-            env = MultiAgentVectorEnv(network, num_envs=2)
+            env = MultiAgentVectorEnv(network, num_envs=copies)
     if not short:
         assert env.dynamics.taylor is not None
         env.dynamics.taylor._shortcut = None
@@ -79,7 +81,7 @@ def played(network: Network, seed: int, *, short: bool = True, kept: Iterable[in
     rng = np.random.default_rng(seed)
     found = []
     for _ in range(network.episode.horizon):
-        outcome = env.advance(rng.uniform(-1, 1, (len(env.agents), 2)))
+        outcome = env.advance(rng.uniform(-1, 1, (len(env.agents), copies)))
         found += [outcome.flow, env.physical.stock]
     return found
 
@@ -397,7 +399,7 @@ def test_chains_of_stores_move_what_the_sparse_sum_does(seed: int) -> None:
         return StoreChains(gives, [], [], first)
 
     network = chained(seed)
-    ours = played(network, seed)
+    ours = played(network, seed, copies=MANY)
     dynamics = MultiAgentVectorEnv(network).dynamics
     assert dynamics.taylor is not None and dynamics.taylor._shortcut is not None
     chains = dynamics.taylor._shortcut._chains
@@ -406,9 +408,24 @@ def test_chains_of_stores_move_what_the_sparse_sum_does(seed: int) -> None:
     least = sum(count - 1 for count in stages if count > SHORT) * (1 + len(network.substances))
     assert len(chains.flows) >= least
     with patch("cirl_marl.dynamics.taylor.StoreChains", none):
-        theirs = played(network, seed)
+        theirs = played(network, seed, copies=MANY)
     for one, other in zip(ours, theirs, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-13)
+
+
+@given(seed=st.integers(0, 2**31))
+@settings(max_examples=10)
+def test_many_copies_move_along_chains_as_few_do(seed: int) -> None:
+    """To the bit: many take slices of rows, few the sparse sum."""
+    network, rng = chained(seed), np.random.default_rng(seed)
+    many, lone = (MultiAgentVectorEnv(network, num_envs=count) for count in (MANY, 1))
+    many.reset(seed=seed)
+    lone.reset(seed=seed + MANY - 1)
+    for _ in range(network.episode.horizon):
+        actions = rng.uniform(-1, 1, (len(many.agents), MANY))
+        flow, own = many.advance(actions).flow, lone.advance(actions[:, -1:]).flow
+        np.testing.assert_array_equal(flow[:, -1:], own)
+        np.testing.assert_array_equal(many.physical.stock[:, -1:], lone.physical.stock)
 
 
 @given(seed=st.integers(0, 2**31), stores=st.integers(1, 40), short=st.sampled_from((1, 2, 8)))
@@ -438,11 +455,16 @@ def test_chains_add_up_to_what_stores_change_by(seed: int, stores: int, short: i
     assert len(set(rows.tolist())) == len(rows) == len(chains.flows)
     assert all(run.stop - run.start >= short for run in chains.runs)
     np.testing.assert_array_equal(drivers[chains.flows], rows)
-    chains.changes(mass, rate[chains.flows], change)()
+    chains.changes(mass, rate[chains.flows], np.empty_like(flow[chains.flows]), change)()
     np.testing.assert_array_equal(np.flatnonzero(np.isfinite(change).all(axis=1)), np.sort(rows))
     change = np.nan_to_num(change)
+    moved = np.zeros_like(change)
+    for name, parts in chains.moves.items():
+        for end, part in parts.items():
+            moved[end - first] += part * flow[name - 100]
+    np.testing.assert_array_equal(moved, change)
     for name, parts in gives.items():
-        assert parts or name == 1
+        assert parts or name not in chains.moves
         for end, part in parts.items():
             change[end - first] += part * (flow[name - 100] if name >= 100 else 1.0)
     np.testing.assert_allclose(change, whole, rtol=1e-12, atol=1e-12)

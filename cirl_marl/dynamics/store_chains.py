@@ -10,19 +10,20 @@ from cirl_marl.dynamics.static_elimination import SparseRow
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.rowsum import spans
 
-SHORT = 8
-"""Least number of rows in a run: of fewer the calls take longer than what they save in some hundreds of copies."""
+SHORT, MANY = 8, 16
+"""Least number of rows in a run, and of copies: of fewer the calls take longer than what they save."""
 
 
 class StoreChains:
     """Stores in rows one after the other, most of which get what leaves the store in the row before.
 
     Of such flows f_i = r_i·x_i a run of stores changes by ẋ_i = f_{i−1} − f_i: two operations over all its rows. What
-    else a store gets or gives comes on top.
+    else a store gets or gives comes on top. A sum of two is the same to the bit in whatever order.
 
     Attributes:
         runs: rows of the stores.
         flows: their flows among all that vary from copy to copy, in the order of the rows.
+        moves: what each of these, by name, moves along the chains.
     """
 
     def __init__(self, gives: dict[int, SparseRow], drivers: Sequence[int], flows: Sequence[int], first: int) -> None:
@@ -47,47 +48,48 @@ class StoreChains:
         self._parts = spans(map(len, pieces))
         rows: Integers = np.concatenate([all_rows[:0], *pieces])
         self.flows: Integers = np.array([flow_of[row] for row in rows.tolist()], dtype=np.intp)
-        self._heads: list[Integers | slice] = []
+        self.moves: dict[int, SparseRow] = {flows[k]: {} for k in self.flows.tolist()}
+        heads: list[int] = []
         for piece in pieces:
-            heads: list[int] = []
-            before: SparseRow = {}
-            for place, row in enumerate(piece.tolist()):
-                if before.get(first + row) == 1.0:
-                    del before[first + row]
+            before = -1
+            for row in piece.tolist():
+                name = flows[flow_of[row]]
+                if gives.get(before, {}).get(first + row) == 1.0:
+                    self.moves[before][first + row] = gives[before].pop(first + row)
                 else:
-                    heads.append(place)
-                before = gives[flows[flow_of[row]]]
-                del before[first + row]
-            self._heads.append(_places(np.array(heads, dtype=np.intp)))
-        for k in self.flows.tolist():
-            if not gives[flows[k]]:
-                del gives[flows[k]]
+                    heads.append(row)
+                self.moves[name][first + row] = gives[name].pop(first + row)
+                before = name
+        for name in self.moves:
+            if not gives[name]:
+                del gives[name]
+        self._heads, self._head_flows = _places(np.array(heads, dtype=np.intp)), _places(np.searchsorted(rows, heads))
 
-    def changes(self, masses: Floats, rates: Floats, change: Floats) -> Callable[[], None]:
+    def changes(self, masses: Floats, rates: Floats, flow: Floats, change: Floats) -> Callable[[], None]:
         """Return what writes what the stores change by, as often as it is called.
 
         Args:
             masses: of all stores, shape (masses, B).
             rates: r of ``flows``, shape (flows, B).
+            flow: for what they carry, likewise.
             change: for ẋ, shape (masses, B); rows of other stores stay as they are.
         """
         multiply, subtract = np.multiply, np.subtract
-        # one array for the flows of all runs stays in a cache
-        flow = np.empty_like(rates[: max((run.stop - run.start for run in self.runs), default=0)])
-        runs = []
-        for run, part, heads in zip(self.runs, self._parts, self._heads, strict=True):
-            moved, result = flow[: run.stop - run.start], change[run]
-            views = (moved[heads], result[heads]) if isinstance(heads, slice) else None
-            runs.append((masses[run], rates[part], moved, moved[:-1], moved[1:], result, result[1:], heads, views))
+        runs = [
+            (masses[run], rates[part], flow[part], flow[part][:-1], flow[part][1:], change[run][1:])
+            for run, part in zip(self.runs, self._parts, strict=True)
+        ]
+        head_flow, head_change = flow[self._head_flows], change[self._heads]
+        are_views = isinstance(self._heads, slice) and isinstance(self._head_flows, slice)
 
         def write() -> None:
-            for stock, rate, moved, before, after, result, difference, heads, views in runs:
+            for stock, rate, moved, before, after, difference in runs:
                 multiply(stock, rate, moved)
                 subtract(before, after, difference)
-                if views is None:
-                    result[heads] = 0.0 - moved[heads]
-                else:
-                    subtract(0.0, *views)
+            if are_views:
+                subtract(0.0, head_flow, head_change)
+            else:
+                change[self._heads] = 0.0 - flow[self._head_flows]
 
         return write
 

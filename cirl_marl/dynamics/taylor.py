@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.dynamics.routing import IntervalRoutes, Routing
 from cirl_marl.dynamics.static_elimination import SparseRow, contract_hubs, square_matrix
-from cirl_marl.dynamics.store_chains import StoreChains
+from cirl_marl.dynamics.store_chains import MANY, StoreChains
 from cirl_marl.network import Floats, Integers, RowSum
 from cirl_marl.network.elements import Law
 from cirl_marl.network.rowsum import spans
@@ -170,10 +171,9 @@ class KronReduction:
         before = contract_hubs(inflow_rows, routing.detours.order)
         drivers, all_flows = laws.driver[varying_flows], range(flow, share)
         self._chains = StoreChains(inflow_rows, drivers.tolist(), all_flows, nodes)
-        self._chain_flows = varying_flows[self._chains.flows]
-        flow_names = [name for name in all_flows if name in inflow_rows]
-        remaining_flows = np.array(flow_names, dtype=np.intp) - flow
-        self._varying_flows, self._drivers = varying_flows[remaining_flows], drivers[remaining_flows]
+        flow_names = [*self._chains.moves, *(k for k in all_flows if k in inflow_rows and k not in self._chains.moves)]
+        flow_places = np.array(flow_names, dtype=np.intp) - flow
+        self._varying_flows, self._drivers = varying_flows[flow_places], drivers[flow_places]
         spread = _outflow_rows(routing, rates, range(share, end), varying_exits)
         after = contract_hubs(spread, routing.detours.order)
         inflows = [kept_nodes[i] for i in order]
@@ -188,11 +188,13 @@ class KronReduction:
         starts = [hubs.start, *(first + run.stop for run in self._chains.runs)]
         stops = [*(first + run.start for run in self._chains.runs), first + laws.rows.nodes.stop]
         self._sums = [slice(start, stop) for start, stop in zip(starts, stops, strict=True) if start < stop]
+        self._all_sums = [slice(starts[0], stops[-1])]
         rows = [
             dict(zip(columns, range(part.start, part.stop), strict=True))
             for columns, part in zip(names, parts, strict=True)
         ]
         self._inflow_matrix = square_matrix(inflow_rows, rows[0] | rows[1] | rows[2] | rows[3] | rows[8], size)
+        self._chain_matrix = square_matrix(self._chains.moves, rows[1] | rows[8], size)
         self._spread = square_matrix(spread, rows[5] | rows[6] | rows[7] | rows[8], size)
 
     def series(self, stock: Floats, routes: IntervalRoutes, factors: Sequence[float], rate: Floats) -> Floats:
@@ -204,23 +206,33 @@ class KronReduction:
             factors: …, b, a, from the innermost.
             rate: shape (arcs, B).
         """
+        batch, chains = stock.shape[1], self._chains
         rates, shares = rate.take(self._varying_flows, 0), routes.rate.take(self._varying_arcs, 0)
-        work: Floats = np.zeros((self._change.stop, stock.shape[1]))
+        work: Floats = np.zeros((self._change.stop, batch))
         mean: Floats = work[self._masses]
         flows, passing, sent_rows = work[self._flows], work[self._passing], work[self._sent_rows]
-        varying_rows, change, sums = work[self._varying_rows], work[self._change], [work[rows] for rows in self._sums]
+        varying_rows, change = work[self._varying_rows], work[self._change]
         # what is called in each term is looked up once, as a call of few copies takes longer than what it does
         take, send, multiply = mean.take, passing.take, np.multiply
-        along_chains = self._chains.changes(mean, rate.take(self._chain_flows, 0), change)
-        enter, spread = (matrix.kernel(stock.shape[1]) for matrix in (self._inflow_matrix, self._spread))
+        enter, spread = (matrix.kernel(batch) for matrix in (self._inflow_matrix, self._spread))
+        drivers, sum_rows = self._drivers, self._all_sums
+        moves: list[Callable[[], object]] = []
+        if chains.runs and batch >= MANY:
+            count, sum_rows = len(chains.flows), self._sums
+            moves.append(chains.changes(mean, rates[:count], flows[:count], change))
+            drivers, flows, rates = drivers[count:], flows[count:], rates[count:]
+        elif chains.runs:
+            moves.append(partial(self._chain_matrix.kernel(batch), work, work))
+        sums = [work[rows] for rows in sum_rows]
         passes = routes.kept_nodes.passes(passing)
         mean[...] = stock
         for factor in factors:
-            take(self._drivers, 0, flows, "clip")  # "raise" would copy
+            take(drivers, 0, flows, "clip")  # "raise" would copy
             multiply(flows, rates, flows)
             for rows in sums:
                 rows.fill(0.0)
-            along_chains()
+            for move in moves:
+                move()
             enter(work, work)
             for pass_on in passes:
                 pass_on()
