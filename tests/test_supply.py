@@ -35,6 +35,7 @@ from cirl_marl.controllers.outcome import service_shortages
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.definitions.reader import write_network
 from cirl_marl.dynamics import supply
+from cirl_marl.dynamics.complementarity import complementary
 from cirl_marl.network import Network
 from cirl_marl.network.elements import Lifetime
 from cirl_marl.optimum import bound, improve_plan, simulate_plan
@@ -273,6 +274,26 @@ def test_nothing_lacks_that_can_be_had_and_nothing_is_supplied_in_vain(seed: int
             np.testing.assert_allclose(extent[0, proportional], extent[1, proportional], rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize(("seed", "count", "is_fast"), [(1, 3, True), (4, 4, False), (7, 5, True)])
+def test_supplies_within_their_bounds_meet_demand_to_ten_digits(seed: int, count: int, is_fast: bool) -> None:
+    """One part in ten thousand million of it, not in a hundred million, where estimates end before that."""
+    network = workshops(seed, count, is_fast=is_fast)
+    traders = [arc.id for arc in network.arcs if arc.id.startswith("trade")]
+    env, errors = MultiAgentVectorEnv(network, num_envs=6, agents=traders), []
+    env.reset(seed=0)
+    for year in range(4):
+        env.advance(np.random.default_rng(seed + year).uniform(-1, 1, (len(traders), 6)))
+        stock = env.rows.stocks(env.physical.stock)
+        for i, service in enumerate(network.services):
+            rows = [network.control_rows[f"mine_{i}_{n}"].start for n in (0, 1)]
+            low, high = (table[rows, :1] for table in (env.dynamics.control_low, env.dynamics.control_high))
+            is_between = ((env.controls[rows] > low * 1.000001) & (env.controls[rows] < high * 0.999999)).all(axis=0)
+            demand = network.interval_means(service.low)[year]
+            errors += np.abs(stock[network.node_index[service.provider], is_between] / demand - 1.0).tolist()
+    assert len(errors) > 4
+    assert max(errors) < 1.001e-10
+
+
 def ring() -> Network:
     """Return five markets in a ring, of which three services are fed by supplies that soon come to their bounds."""
     fed = {"m0": "m1 0.197, p1", "m1": "m2 0.189, p0 0.385, dump", "m2": "m3 *, p1 0.115, p1", "m3": "m4 *, p1"}
@@ -434,6 +455,57 @@ def reserve(stock: float, most: float, demand: float = 47.0, export: float = 0.0
         services=(Service(id="need", provider="use", quantity="stock", low=demand),),
         episode=Episode(horizon=6),
     )
+
+
+def twins(demand: tuple[float, float], most: tuple[float, float], rate: float) -> Network:
+    """Return two products, each with a mine and a demand of its own."""
+    nodes, arcs = list[Node](), list[Arc]()
+    for i, high in enumerate(most):
+        nodes.append(Node(id=f"use_{i}", rate=rate, initial=(20.0, 90.0)))
+        arcs.append(Arc(id=f"old_{i}", donor=f"use_{i}", recipient="dump", law=Law.SHARE))
+        control = Control(kind=ControlKind.FLOW, low=0.0, neutral=0.0, high=high)
+        made_up: dict[str, Any] = {"control": control, "makes_up_for": f"need_{i}"}
+        arcs.append(Arc(id=f"mine_{i}", donor="ore", recipient=f"use_{i}", law=Law.CONTROLLED, **made_up))
+    ends = (Node(id="ore", role=Role.NONRENEWABLE_RESERVOIR), Node(id="dump", role=Role.LANDFILL, initial=(0.0, 0.0)))
+    services = tuple(
+        Service(id=f"need_{i}", provider=f"use_{i}", quantity="stock", low=low, high=99.0)
+        for i, low in enumerate(demand)
+    )
+    return Network(name="twins", nodes=(*nodes, *ends), arcs=tuple(arcs), services=services, episode=Episode(horizon=2))
+
+
+def test_what_nothing_is_demanded_of_is_not_supplied_in_vain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Corrections that supply it by mistake are themselves corrected, though nothing else lacks then."""
+    env, solve, calls = MultiAgentVectorEnv(twins((0.0, 47.0), (1e4, 1e4), 0.1), num_envs=1), complementary, list[int]()
+    env.reset(seed=0, options={"initial_state": {"use_0": 50.0, "use_1": 50.0}})
+
+    def mistaken(*args: Any) -> Floats:
+        calls.append(1)
+        supplied: Floats = solve(*args) + np.array([[5.0 * (len(calls) <= 2)], [0.0]])
+        return supplied
+
+    monkeypatch.setattr(supply, "complementary", mistaken)
+    monkeypatch.setattr(supply, "LEVELS", supply.LEVELS[-1:])
+    state = env.physical
+    supplied = env.supply(state.stock, state.inner, env.controls * 0.0, state.step, np.ones((2, 1), dtype=bool))
+    assert supplied[0, 0] == 0.0
+    assert supplied[1, 0] > 1.0
+
+
+def test_a_copy_that_is_done_keeps_what_it_lacked() -> None:
+    """As a lone one does, also where it came to a bound then while another copy had yet to be corrected."""
+    network, starts = twins((50.0, 50.0), (0.5, 99.0), 0.01), np.exp(0.01) * np.array([[49.25, 20.0], [49.95, 40.0]])
+
+    def advanced(copies: slice) -> Floats:
+        stocks = {f"use_{i}": stock[copies] for i, stock in enumerate(starts)}
+        env = MultiAgentVectorEnv(network, num_envs=len(stocks["use_0"]))
+        env.reset(seed=0, options={"initial_state": stocks})
+        state, idle = env.physical, np.ones((2, 1), dtype=bool)
+        return env.supply.advance(state.stock, state.inner, env.controls * 0.0, state.step, idle)[1].stock
+
+    together = advanced(slice(None))
+    np.testing.assert_array_equal(together[:, :1], advanced(slice(1)))
+    np.testing.assert_array_equal(together[:, 1:], advanced(slice(1, None)))
 
 
 def test_what_a_correction_brought_tells_how_the_next_one_does(monkeypatch: pytest.MonkeyPatch) -> None:

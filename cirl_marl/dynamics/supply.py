@@ -231,10 +231,10 @@ class Supply:
                 supply[:, wrong] = complementary(slope[wrong], short, now, most, self._interval)
                 change = supply - before
                 expected = np.where(is_wrong, (slope * np.ascontiguousarray(change.T)[:, None]).sum(axis=2).T, expected)
-                lacks, earlier_lack = np.divide(gap, demand, out=np.zeros_like(gap), where=demand > 0), lack
+                # what nothing is demanded of lacks as a whole
+                lacks, earlier_lack = np.divide(gap, demand, out=np.sign(gap), where=demand > 0), lack
                 lack = np.where(is_wrong, lacks.max(axis=0), lack)  # others keep theirs, as if they were alone
-                may_lack = terms is None or lack * lack > accuracy * earlier_lack
-                open_ = is_wrong & may_lack & (change != 0.0).any(axis=0)
+                open_ = is_wrong & (lack * lack > accuracy * earlier_lack) & (change != 0.0).any(axis=0)
                 if not open_.any():
                     break
         assert done is not None
