@@ -43,19 +43,18 @@ class _Round:
     """Nodes that are eliminated together, and the shares of theirs that are left then."""
 
     nodes: Annotated[Integers, "the nodes"]
-    out: Annotated[Integers, "entries of the shares that they give to nodes eliminated later"]
-    giver: Annotated[Integers, "which of ``nodes`` each belongs to"]
-    out_sum: Annotated[RowSum, "sum of ``out`` for each of ``nodes``"]
-    into: Annotated[Integers, "entries of the shares that they get from nodes eliminated later"]
-    getter: Annotated[Integers, "which of ``nodes`` each belongs to"]
-    first: Annotated[Integers, "of each detour past a node of the round, its way in, among ``into``"]
-    second: Annotated[Integers, "and its way out, among ``out`` and then ``nodes`` for what leaves the set"]
+    entries: Annotated[Integers, "of the shares that they give to nodes eliminated later, of what leaves, and get"]
+    giver: Annotated[Integers, "which of ``nodes`` each of the first belongs to"]
+    out_sum: Annotated[RowSum, "sum of the first for each of ``nodes``"]
+    getter: Annotated[Integers, "which of ``nodes`` each of the last belongs to"]
+    first: Annotated[Integers, "of each detour past a node of the round, its way in, among the last"]
+    second: Annotated[Integers, "and its way out, among the others"]
     detours: Annotated[RowSum, "adds the detours to the entries of the shares that they make up"]
-    forward: Annotated[RowSum, "adds what ``out`` carries to the nodes that get it"]
-    donors: Annotated[Integers, "node that gives each of ``out``"]
+    forward: Annotated[RowSum, "adds what is given on to the nodes that get it"]
+    donors: Annotated[Integers, "node that gives each of the first"]
     recipients: Annotated[Integers, "node that gets each of them"]
-    backward: Annotated[RowSum, "adds what ``into`` carries to ``nodes``"]
-    sources: Annotated[Integers, "node that gives each of ``into``"]
+    backward: Annotated[RowSum, "adds what comes back to ``nodes``"]
+    sources: Annotated[Integers, "node that gives each of the last"]
 
 
 class EliminationOrder:
@@ -186,8 +185,8 @@ class EliminationOrder:
         """``forward`` and ``backward`` of each round the other way, from those that get to those that give."""
         return [
             (
-                RowSum(round_.donors, np.arange(len(round_.out)), 1.0, (self.nodes, len(round_.out))),
-                RowSum(round_.sources, np.arange(len(round_.into)), 1.0, (self.nodes, len(round_.into))),
+                RowSum(round_.donors, np.arange(len(round_.donors)), 1.0, (self.nodes, len(round_.donors))),
+                RowSum(round_.sources, np.arange(len(round_.sources)), 1.0, (self.nodes, len(round_.sources))),
             )
             for round_ in self.rounds
         ]
@@ -207,10 +206,9 @@ class EliminationOrder:
         entries = self.entries(into[first], ends[is_detour])
         return _Round(
             nodes=nodes,
-            out=self.entries(nodes[giver], out),
+            entries=np.concatenate([self.entries(nodes[giver], out), nodes, self.entries(into, nodes[getter])]),
             giver=giver,
             out_sum=RowSum(giver, np.arange(len(out)), 1.0, (len(nodes), len(out))),
-            into=self.entries(into, nodes[getter]),
             getter=getter,
             first=first,
             second=second,
@@ -262,14 +260,17 @@ class EliminatedShares:
         self._steps = []
         self._inverse = np.ones((order.nodes, values.shape[1]))
         for round_ in order.rounds:
-            out, into, exits = values.take(round_.out, 0), values.take(round_.into, 0), values.take(round_.nodes, 0)
+            shares, ways, leave = (
+                values.take(round_.entries, 0),
+                len(round_.giver),
+                len(round_.giver) + len(round_.nodes),
+            )
+            out, exits, onward, into = shares[:ways], shares[ways:leave], shares[:leave], shares[leave:]
             # the pivot 1 − P_ii as the sum of what goes elsewhere, so that nothing cancels
             inverse = 1.0 / round_.out_sum.add_to(exits.copy(), out)
             out *= inverse.take(round_.giver, 0)
             exits *= inverse
-            round_.detours.add_to(
-                values, into.take(round_.first, 0) * np.concatenate([out, exits]).take(round_.second, 0)
-            )
+            round_.detours.add_to(values, into.take(round_.first, 0) * onward.take(round_.second, 0))
             into *= inverse.take(round_.getter, 0)
             self._inverse[round_.nodes] = inverse
             self._steps.append((round_, out, into))
