@@ -68,8 +68,10 @@ class Loads:
         np.add.at(adjoint, self._orders, load * content)
 
     def _per_stock(self, available_stock: Floats) -> Floats:
-        whole = available_stock.take(self._places, axis=0)
-        return np.divide(1.0, whole, out=np.zeros_like(whole), where=whole > NEGLIGIBLE)
+        per_stock = np.divide(
+            1.0, available_stock, out=np.zeros_like(available_stock), where=available_stock > NEGLIGIBLE
+        )
+        return per_stock.take(self._places, axis=0)
 
 
 class ScheduledFlows:
