@@ -550,6 +550,31 @@ def test_merged_pieces_are_as_tight() -> None:
     assert proved[1] == pytest.approx(proved[0], rel=0.05)
 
 
+@pytest.mark.parametrize("rate", [0.7, 8.0])
+def test_a_furnace_that_is_fed_by_schedule_is_known(rate: float) -> None:
+    """With x' = u − k·x there is no choice: what is there at the end of a merged piece is u/k + (x_0 − u/k)·e^{−k}."""
+    network = Network(
+        name="smelter",
+        nodes=(
+            Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR, initial=(500.0, 500.0)),
+            Node(id="furnace", initial=(2.0, 2.0)),
+            Node(id="tip", role=Role.LANDFILL, initial=(1.0, 1.0)),
+        ),
+        arcs=(
+            Arc(id="mining", donor="mine", recipient="furnace", law=Law.EXOGENOUS, flow=4.0),
+            Arc(id="slag", donor="furnace", recipient="tip", rate=rate),
+        ),
+        episode=Episode(control_interval=1.0, horizon=1),
+    )
+    programs = Programs(Admissible.of(network), 2, None, merge_pieces=True)
+    problem, last = programs.program(network.initial[1]), programs.layout.last.start + network.node_index["furnace"]
+    for sign in (1.0, -1.0):
+        cost = np.zeros_like(problem.cost)
+        cost[last] = sign
+        end = float(solve(replace(problem, cost=cost)).plan[last])
+        assert end == pytest.approx(4.0 / rate + (2.0 - 4.0 / rate) * math.exp(-rate), rel=1e-6)
+
+
 @pytest.mark.medium
 @pytest.mark.sample(2)
 @pytest.mark.parametrize("merged", [False, True])

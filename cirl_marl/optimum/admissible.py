@@ -239,6 +239,7 @@ class IntervalRanges:
 
     Attributes:
         proportional: arcs whose flow is a rate times what drives it: no schedule, no lifetime, shape (arcs,).
+        leaves_lifetime: arcs that carry what has lived, likewise.
         release: rate at which each stock is released to be shared out, lowest and highest, 1/time, shape (2, nodes).
         exits: rate at which each stock leaves in proportion to itself, likewise.
         free_splits: the splits in which some share can be chosen.
@@ -258,8 +259,8 @@ class IntervalRanges:
         self.driver, self.service_low = admissible.driver, admissible.service_low[step]
         self.capacity_arcs, self.capacity_rate = admissible.capacity_arcs, admissible.capacity_rate[step]
         self.totals = admissible.lifetimes.totals
-        self.proportional = ~self.by_schedule
-        self.proportional[admissible.lifetimes.exit_arcs] = False
+        self.leaves_lifetime = np.isin(np.arange(len(network.arcs)), admissible.lifetimes.exit_arcs)
+        self.proportional = ~self.by_schedule & ~self.leaves_lifetime
         self.release = np.zeros((2, len(network.nodes)))
         self.free_splits = []
         for split in admissible.splits:

@@ -1,13 +1,13 @@
 """How fast stocks can fall, and how fast stocks follow slow ones: rows of theorems 2 and 3 of docs/bound.md.
 
 **How fast a stock can fall.** Within a piece ẋ ≥ −k x − U, with k the greatest rate of the proportional exits and U the
-scheduled outflow, so y(s) = e^{ks} (x(s) + U (1 − e^{−ks})/k) never falls. Weighted with B_i(s) e^{−ks} its means rise
-with i::
+scheduled outflow less the scheduled inflow, so y(s) = e^{ks} (x(s) + U (1 − e^{−ks})/k) never falls. Weighted with
+B_i(s) e^{−ks} its means rise with i::
 
     x_start ≤ X̃_0/ω_0 ≤ … ≤ X̃_d/ω_d ≤ x̃_end/e^{−kδ},    X̃_i = X_i + U η_i,
 
 with ω_i the mean of e^{−ks} and η_i that of (1 − e^{−ks})/k, weighted with B_i. Controls are constant within a piece,
-so (w − w̲)·x and (w̄ − w)·x obey the same, with U times the range of w.
+so (w − w̲)·x and (w̄ − w)·x obey the same, with the scheduled outflow times the range of w.
 
 **Quasi-steady stocks.** Take the stores of a residence time far below a piece as fast, x, the others as slow. With the
 controls of an interval ẋ = M x + g, the entries of M off the diagonal and g, the flows from slow stocks and by
@@ -88,9 +88,12 @@ class _DecayChains:
         self.delays = np.divide(1.0 - self.means, rate[:, None], out=slow.copy(), where=turnover >= 1e-6)
         self.layout, self.rows = layout, rows
         self.first = np.arange(layout.pieces) * (d + 1)  # moment of each piece
-        arcs = np.flatnonzero(ranges.by_schedule)
-        places = (ranges.network.donors[arcs], arcs)
-        self.schedules = sparse.csr_array((np.ones(len(arcs)), places), shape=(len(rate), len(ranges.driver)))
+        network, arcs, shape = ranges.network, np.flatnonzero(ranges.by_schedule), (len(rate), len(ranges.driver))
+        self.outflow = sparse.csr_array((np.ones(len(arcs)), (network.donors[arcs], arcs)), shape=shape)
+        # of what enters a lifetime a part may leave at once
+        into = np.setdiff1d(arcs, np.flatnonzero(np.isin(network.recipients, network.donors[ranges.leaves_lifetime])))
+        inflow = sparse.csr_array((np.ones(len(into)), (network.recipients[into], into)), shape=shape)
+        self.net_outflow = self.outflow - inflow
 
     def write_stocks(self, nodes: Integers) -> None:
         """Write the chain of each stock from the start of a piece to its end."""
@@ -100,13 +103,13 @@ class _DecayChains:
         start = rows.add(1, nodes, piece, -1)
         rows.at_start(start, piece, nodes, means[:, 0])
         rows.put(start, layout.stock[moment] + nodes, -1.0)
-        self._put_schedules(start, nodes, -delays[:, 0])
-        self._write_steps(nodes, -1, [(nodes, 1.0)], 1.0)
+        self._put_schedules(start, self.net_outflow[nodes], -delays[:, 0])
+        self._write_steps(nodes, -1, [(nodes, 1.0)], self.net_outflow[nodes])
         end = rows.add(1, nodes, piece, -1, d + 1)
         ratio = means[:, d + 1] / means[:, d]  # (X_d + U η_d)/ω_d ≤ (x_end + U η_end)/e^{−kδ}, times e^{−kδ}
         rows.put(end, layout.stock[moment + d] + nodes, ratio)
         rows.put(end, layout.end[piece] + nodes, -1.0)
-        self._put_schedules(end, nodes, ratio * delays[:, d] - delays[:, d + 1])
+        self._put_schedules(end, self.net_outflow[nodes], ratio * delays[:, d] - delays[:, d + 1])
 
     def write_factors(
         self, nodes: Integers, quantity: Integers, column: Integers, driver: Integers, factor: Floats, scale: Any
@@ -125,13 +128,14 @@ class _DecayChains:
         nodes, quantity, column, driver = (part[free] for part in (nodes, quantity, column, driver))
         low, high = factor[:, free]
         spread = (high - low) * np.broadcast_to(scale, free.shape)[free]
-        self._write_steps(nodes, 2 * quantity, [(column, 1.0), (driver, -low)], spread)
-        self._write_steps(nodes, 2 * quantity + 1, [(column, -1.0), (driver, high)], spread)
+        outflow = sparse.diags_array(spread) @ self.outflow[nodes]
+        self._write_steps(nodes, 2 * quantity, [(column, 1.0), (driver, -low)], outflow)
+        self._write_steps(nodes, 2 * quantity + 1, [(column, -1.0), (driver, high)], outflow)
 
     def _write_steps(
-        self, nodes: Integers, quantity: int | Integers, terms: list[tuple[Integers, Any]], spread: float | Floats
+        self, nodes: Integers, quantity: int | Integers, terms: list[tuple[Integers, Any]], outflow: Any
     ) -> None:
-        """Write ω_{i+1}/ω_i·q_i − q_{i+1} − spread·U·(…) ≤ 0 for q a sum of columns of a moment, each with a weight."""
+        """Write ω_{i+1}/ω_i·q_i − q_{i+1} − U·(…) ≤ 0 for q a sum of columns of a moment, each with a weight."""
         layout, rows = self.layout, self.rows
         piece, moment = np.arange(layout.pieces)[:, None], self.first[:, None]
         means, delays = self.means[nodes], self.delays[nodes]
@@ -142,19 +146,20 @@ class _DecayChains:
             for column, weight in terms:
                 rows.put(row, layout.stock[moment + i] + column, ratio * weight)
                 rows.put(row, layout.stock[moment + i + 1] + column, -weight)
-            self._put_schedules(row, nodes, spread * (ratio * delays[:, i] - delays[:, i + 1]))
+            self._put_schedules(row, outflow, ratio * delays[:, i] - delays[:, i + 1])
 
-    def _put_schedules(self, row: Integers, nodes: Integers, weight: Floats) -> None:
-        """Put a weight at every scheduled outflow of each row's node; rows are of shape (pieces, nodes).
+    def _put_schedules(self, row: Integers, outflow: Any, weight: Floats) -> None:
+        """Put a weight, at most 0, times U into rows of shape (pieces, nodes), with U = ``outflow``·flows.
 
         In coarse pieces what is asked in the interval stands for it; a flow that may be cut is below it at times.
         """
-        schedules = self.schedules[nodes].tocoo()
+        schedules = sparse.coo_array(outflow)
         place, arcs = schedules.row, schedules.col
+        values = weight[place] * schedules.data
         moment = 0 * self.first if self.layout.coarse else self.first
-        self.rows.put(row[:, place], self.layout.flow[moment[:, None]] + arcs, weight[place])
+        self.rows.put(row[:, place], self.layout.flow[moment[:, None]] + arcs, values)
         if self.layout.coarse:
-            self.rows.loosen(row[:, place], arcs, np.maximum(-weight[place], 0.0))
+            self.rows.loosen(row[:, place], arcs, np.abs(values))
 
 
 def has_fast_stocks(admissible: Admissible, length: float) -> bool:
