@@ -49,6 +49,7 @@ from cirl_marl.optimum import NoCertificate, bound
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.program import Program, Programs
+from cirl_marl.optimum.quasi_steady import cut_responses
 from cirl_marl.optimum.solver import solve
 
 Floats = NDArray[np.float64]
@@ -656,6 +657,27 @@ def test_shares_of_what_a_hoard_has_left(past: str, refilled: bool, merged: bool
     for seed, style in enumerate(("inside", "ends", "high")):
         for degree in (1, 2):
             assert_holds(play(network, np.random.default_rng(seed), style), degree, None, merged)
+
+
+def test_what_is_cut_misses_as_long_as_a_furnace_holds_it() -> None:
+    """Of a flow of 1 into furnaces of rates 12 and 3 in a row, ∫ e^{−12s} ds and ∫∫ e^{−3(s−u)} 12 e^{−12u} miss."""
+    names = ("first", "second")
+    nodes = (*(Node(id=name, initial=(1.0, 1.0)) for name in names), Node(id="tip"), Node(id="sale", stores=False))
+    arcs = (
+        Arc(id="melt", donor="first", recipient="sale", rate=12.0),
+        Arc(id="cast", donor="sale", recipient="second", law=Law.SHARE),
+        Arc(id="slag", donor="second", recipient="tip", rate=3.0),
+    )
+    network = Network(name="row", nodes=nodes, arcs=arcs, episode=Episode(control_interval=0.5, horizon=1))
+    programs = Programs(Admissible.of(network), 1, None)
+    ranges, linear = programs.admissible.ranges[0], programs.system.of_interval(0)
+    responses, arrivals = cut_responses(ranges, linear, np.arange(2))
+    first, second = (-math.expm1(-rate / 2) / rate for rate in (12.0, 3.0))
+    behind = (12.0 * second - 12.0 * first) / 9.0  # of 12 (e^{−3 s} − e^{−12 s})/9
+    sale = network.node_index["sale"]
+    assert responses[[0, 1, sale], 0] == pytest.approx([first, behind, 12.0 * first], rel=1e-8)
+    assert responses[[0, 1, sale], sale] == pytest.approx([0.0, second, 1.0], rel=1e-8, abs=1e-11)
+    assert arrivals[:2, 0] == pytest.approx([1.0, 12.0 * first], rel=1e-8)
 
 
 @pytest.mark.parametrize("refilled", [False, True])

@@ -273,9 +273,8 @@ class _QuasiSteady:
         self.transients = np.zeros((rows.layout.degree + 1, len(self.network.nodes), len(self.fast)))
         self.transients[:, self.fast] = means[:-1]
         self.transients[:, self.stores :] = linear.pass_flow.toarray()[:, fast] @ means[:-1]
-        fastest = float(ranges.exits[1, : self.stores].max(initial=0.0))
-        # what an arc carries can be nowhere more than this times what is asked of it
-        self.loose = (1.0 + self.network.episode.control_interval) * (1.0 + fastest) * linear.routes.longest
+        # of what is cut of a flow into a node, the most that misses in each, and of what enters stocks
+        self.responses, self.arrivals = cut_responses(ranges, linear, self.fast)
 
     def _find_sources(self, fast: NDArray[np.bool_]) -> None:
         """Find the nodes that follow from slow stocks and schedules, and the schedules that they follow from."""
@@ -307,12 +306,13 @@ class _QuasiSteady:
             row = self.rows.add(2, self.choice, piece, nodes, i)
             self.rows.put(row, layout.stock[moment] + nodes, 1.0)
             self.rows.put(row, layout.end[piece] + nodes, -growth)
-            self._allow(row, nodes, self.transients[i, nodes], np.ones(len(nodes)))
+            self._allow(row, nodes, self.transients[i, nodes], growth * self.responses[nodes])
             for side in (0, 1):
                 key = self.choice, len(network.nodes) + 2 * arcs + side
                 row = _put_factor(ranges, self.rows, key, arcs, side, i, growth)
                 driver = ranges.driver[arcs]
-                self._allow(row, driver, self.transients[i, driver], high[arcs] - low[arcs])
+                spread = (high[arcs] - low[arcs])[:, None]
+                self._allow(row, driver, spread * self.transients[i, driver], spread * growth * self.responses[driver])
         fast = nodes[nodes < self.stores]
         row = np.full((layout.pieces, len(network.nodes)), -1)
         row[:, fast] = self.rows.add(2, self.choice, piece, fast, layout.degree + 1)
@@ -322,16 +322,45 @@ class _QuasiSteady:
         margin = (ranges.exits[0, np.minimum(into, self.stores - 1)] - slowest) * layout.length
         factor = layout.length * special.exprel(-margin) * WIDER  # (1 − e^{−(k − κ)δ})/(k − κ)
         self.rows.put(row[:, into], layout.end_flow[piece] + inflows, -factor)
-        self._allow(row[:, fast], fast, self.after[np.searchsorted(self.fast, fast)], np.ones(len(fast)))
+        lengths = np.zeros(self.stores)
+        lengths[into] = factor
+        missing = lengths[fast, None] * self.arrivals[fast]
+        self._allow(row[:, fast], fast, self.after[np.searchsorted(self.fast, fast)], missing)
 
-    def _allow(self, row: Integers, nodes: Integers, transients: Floats, factor: Floats) -> None:
-        """Allow for the transients of nodes, and for schedules that may be cut, both times a factor."""
-        transients = transients * factor[:, None]
+    def _allow(self, row: Integers, nodes: Integers, transients: Floats, responses: Floats) -> None:
+        """Allow for the transients of nodes, and for what they respond to schedules that may be cut."""
         place, source = np.nonzero(transients)
         piece = np.arange(self.layout.pieces)[:, None]
         self.rows.at_start(row[:, place], piece, self.fast[source], -transients[place, source])
         place, arcs = np.nonzero(self.schedules[nodes])
-        self.rows.loosen(row[:, place], arcs, self.loose * factor[place])
+        self.rows.loosen(row[:, place], arcs, responses[place, self.network.recipients[arcs]])
+
+
+def cut_responses(ranges: IntervalRanges, linear: Linear, fast: Integers) -> tuple[Floats, Floats]:
+    """Return the most that an interval makes of a flow of at most 1 into each node, 0 before it.
+
+    Fast stocks hold ∫ e^{Ms} ds times what arrives at them. The same misses where so much is cut of a flow.
+
+    Args:
+        ranges: of the interval.
+        linear: what is proportional to stocks in it.
+        fast: stocks that hand on; the others keep it.
+
+    Returns:
+        What fast stocks hold, time, and nodes without stock pass, shape (nodes, nodes that it enters), and what enters
+        stocks, shape (stores, nodes).
+    """
+    network, into = ranges.network, np.eye(len(ranges.network.nodes))
+    stores, interval = len(network.stores), network.episode.control_interval
+    gains = linear.gains.toarray()[:, fast]
+    motion = gains[fast] - np.diag(ranges.exits[0, fast])
+    held = np.maximum(bernstein_means(motion, 0, interval)[0][0] * interval, 0.0) * WIDER + ROUND_OFF
+    arrivals = linear.routes.most(into)
+    stocks = held @ arrivals[fast]
+    responses = np.zeros_like(into)
+    responses[fast] = stocks
+    responses[stores:] = linear.routes.through(into[stores:]) + linear.pass_flow.toarray()[:, fast] @ stocks
+    return responses, arrivals + gains @ stocks
 
 
 def _growth(rate: float | Floats, layout: Layout, i: int) -> Any:

@@ -29,7 +29,7 @@ from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import Admissible, IntervalRanges
 from cirl_marl.optimum.kernels import bernstein_means
 from cirl_marl.optimum.matrices import Layout, ProgramRows
-from cirl_marl.optimum.quasi_steady import FAST, ROUND_OFF, WIDER
+from cirl_marl.optimum.quasi_steady import FAST, ROUND_OFF, WIDER, cut_responses
 from cirl_marl.optimum.reach import Linear
 
 Mask = NDArray[np.bool_]
@@ -100,10 +100,13 @@ class Transit:
         varies += [(arc, arc, 1.0) for arc in exits.tolist()] + [term for term in at_once if term[2] > 0]
         flow, entry, part = zip(*varies, strict=True) if varies else ((), (), ())
         self.varying_flow = np.array(flow, dtype=np.intp)
+        # past fast stocks an order counts by what may be cut of it
+        self._is_order = np.isin(arcs, np.setdiff1d(varying_orders, self.partly_steady))
         self.varying_entry = network.recipients[np.array(entry, dtype=np.intp)]
         self.varying_part = np.array(part, dtype=float)
         first = len(varies) - len(exits) - sum(term[2] > 0 for term in at_once)
         self._exits = slice(first, first + len(exits))
+        self._passes_by_order = (np.arange(len(varies)) < first) & self._is_order[self.varying_flow]
         self._sources: dict[bytes, list[Sources]] = {}
 
     def _spread(self, start: Mask, hands_on: Mask, *, against: bool = False) -> Mask:
@@ -149,9 +152,12 @@ class Transit:
             np.flatnonzero(fast_nodes),
             (
                 np.flatnonzero(direct[network.recipients] & self._dry),
-                np.flatnonzero(behind[network.recipients] & self._dry),
+                np.flatnonzero(behind[network.recipients] & (self._dry | self._is_order)),
             ),
-            (np.flatnonzero(direct[self.varying_entry] & varies), np.flatnonzero(behind[self.varying_entry] & varies)),
+            (
+                np.flatnonzero(direct[self.varying_entry] & varies),
+                np.flatnonzero(behind[self.varying_entry] & varies & ~self._passes_by_order),
+            ),
             not (arcs & into).any() and not (stocks & (slow | fast_nodes)).any(),
         )
 
@@ -311,9 +317,11 @@ class ConstantShares:
         if self.layout.pieces == 1 and not self.layout.coarse:
             return
         direct, behind = sources.dry
-        spread = (factor * np.diff(self.ranges.rate[:, arcs], axis=0))[..., None]
-        self.rows.loosen(rows[..., None], direct, spread * self._visits(donor, self.network.recipients[direct]))
-        self.rows.loosen(rows[..., None], behind, spread * self._most_outflow(donor, sources))
+        spread, recipients = (factor * np.diff(self.ranges.rate[:, arcs], axis=0))[..., None], self.network.recipients
+        self.rows.loosen(rows[..., None], direct, spread * self._visits(donor, recipients[direct]))
+        if len(behind):
+            responses = cut_responses(self.ranges, self.linear, sources.fast)[0]
+            self.rows.loosen(rows[..., None], behind, spread * responses[donor, recipients[behind]])
 
     def _allow_varying(
         self, rows: Integers, donor: int, spread: Floats, sources: Sources, moments: Integers, ratio: Floats
