@@ -680,6 +680,31 @@ def test_what_is_cut_misses_as_long_as_a_furnace_holds_it() -> None:
     assert arrivals[:2, 0] == pytest.approx([1.0, 12.0 * first], rel=1e-8)
 
 
+def test_what_comes_late_has_entered_late() -> None:
+    """A hoard of 6 that gets 4 in a year could send 10 at its end, but orders are even until it is empty."""
+    order = Control(kind=ControlKind.FLOW, low=0.0, neutral=5.0, high=30.0)
+    network = Network(
+        name="hoard",
+        nodes=(
+            Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR, initial=(500.0, 500.0)),
+            Node(id="hoard", initial=(6.0, 6.0)),
+            Node(id="tip", role=Role.LANDFILL, initial=(1.0, 1.0)),
+        ),
+        arcs=(
+            Arc(id="feed", donor="mine", recipient="hoard", law=Law.EXOGENOUS, flow=4.0),
+            Arc(id="order", donor="hoard", recipient="tip", law=Law.CONTROLLED, control=order),
+        ),
+        episode=Episode(control_interval=1.0, horizon=1, solver_step=0.25),
+    )
+    programs = Programs(Admissible.of(network), 1, None, merge_pieces=True)
+    problem, layout = programs.program(network.initial[1]), programs.layout
+    early, late = layout.flow[:2] + network.arc_index["order"]
+    cost = np.zeros_like(problem.cost)
+    cost[early], cost[late] = 1.0, -1.0
+    solution = solve(replace(problem, cost=cost)).plan
+    assert solution[late] - solution[early] == pytest.approx(8.0, rel=1e-6)  # half the difference: at most what enters
+
+
 @pytest.mark.parametrize("refilled", [False, True])
 def test_shares_are_the_same_all_year(refilled: bool) -> None:
     """A market cannot give one product what comes early and another what comes late.

@@ -202,6 +202,25 @@ def constant_schedules(ranges: IntervalRanges, equal: ProgramRows, under: Progra
     equal.put(row, layout.flow[first[later]] + arcs, -1.0)
 
 
+def late_deliveries(ranges: IntervalRanges, rows: ProgramRows) -> None:
+    """Add that schedules deliver late only what enters late, t/T·G(T) − G(t) − t/T·H, at most 0; keys (7, moment, arc).
+
+    G(t) is delivered until t, and H enters the donor in the interval of length T. If all that is asked was delivered
+    until t, G(t) ≥ t/T·G(T). Else the donor was empty once, and what comes later has entered since: G(T) − G(t) ≤ H.
+    In the means weighted with the polynomials of degree d − 1, G(t) is δ/(d + 1)·Σ F_i over the moments until then.
+    """
+    network, layout = ranges.network, rows.layout
+    has_lifetime, count = np.isin(network.donors, network.donors[ranges.leaves_lifetime]), len(layout.moments)
+    arcs = np.flatnonzero(ranges.by_schedule & ~has_lifetime)
+    inflows = [np.flatnonzero(network.recipients == donor) for donor in network.donors[arcs].tolist()]
+    for moment in layout.moments[:-1]:
+        share = (moment + 1) / count
+        row = rows.add(7, moment, arcs)
+        rows.put(row[None], layout.flow[:, None] + arcs, share - (layout.moment_column <= moment))
+        for k, into in zip(row, inflows, strict=True):
+            rows.put(k, layout.flow[:, None] + into, -share)
+
+
 def _hold_schedules(rows: ProgramRows, arcs: Integers, moment: Integers, first: Integers) -> None:
     """Add that scheduled flows in some moments are those of others, but for what is cut."""
     for side, sign in ((0, 1.0), (1, -1.0)):

@@ -27,6 +27,7 @@ from cirl_marl.optimum.constraints import (
     flow_laws,
     held_controls,
     idle_supplies,
+    late_deliveries,
     least_deliveries,
     mean_stocks,
     order_rows,
@@ -164,6 +165,8 @@ class Programs:
         equal_links, equal, under_links, under = (ProgramRows(layout) for _ in range(4))
         balances(equal_links)
         constant_schedules(ranges, equal, under, across=self._transit is not None)
+        if layout.coarse and self.admissible.mixtures is None:
+            late_deliveries(ranges, under)
         flow_laws(ranges, equal, under)
         throughputs(ranges, equal)
         delivery_limits(ranges, under_links)
