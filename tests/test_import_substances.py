@@ -549,8 +549,9 @@ def test_nothing_flows_with_a_content(tmp_path: Path) -> None:
     rows.append(["Mine", "Dump", 2000, "Copper", 4, "%", ""])
     rows += [[*row[:2], 2001, "", 0, "kt/year", ""] for row in rows if not row[3]]
     assert imported(tmp_path, rows).content_error < 1e-9
-    none = import_flows(table(tmp_path / "0.csv", sorting((0, 0, 0))), tmp_path / "none.toml", roles=ROLES)
-    assert none.table.substances is None and "substances" not in (tmp_path / "none.toml").read_text()
+    flows = table(tmp_path / "0.csv", sorting((0, 0, 0)))
+    with pytest.raises(CirlError, match=r"0\.csv: no flow has any Copper; leave its rows out"):
+        import_flows(flows, tmp_path / "none.toml", roles=ROLES)
 
 
 def test_contents_that_do_not_come_back_are_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -596,11 +597,11 @@ def test_the_command_says_what_is_in_it(tmp_path: Path) -> None:
     assert "simulated contents of Copper are up to" in result.output
 
 
-def stored(tmp_path: Path, stocks: Sequence[Row]) -> ImportReport:
-    """Import a use whose stocks have substances."""
-    rows = [
-        *[["Mine", "Use", 2000, substance, value, "kt/year", "10 %"] for substance, value in (("", 10), ("Copper", 1))],
-        *[["Use", "Dump", 2000, substance, value, "kt/year", "10 %"] for substance, value in (("", 8), ("Copper", 2))],
+def stored(tmp_path: Path, stocks: Sequence[Row], dumped: float = 2.0) -> ImportReport:
+    """Import a use whose stocks have substances, and from which so much copper is dumped."""
+    rows: list[Row] = [
+        *[["Mine", "Use", 2000, name, value, "kt/year", "10 %"] for name, value in (("", 10), ("Copper", 1))],
+        *[["Use", "Dump", 2000, name, value, "kt/year", "10 %"] for name, value in (("", 8), ("Copper", dumped))],
     ]
     beside = table(tmp_path / "stocks.csv", stocks, LONG)
     return imported(tmp_path, rows, stocks=beside)
@@ -612,6 +613,39 @@ def test_tables_of_stocks_say_what_is_in_them(tmp_path: Path, value: float, unit
     report = stored(tmp_path, [["Use", 1999, "Copper", value, unit], ["Use", 1999, "", 100, "kt"]])
     use = next(node for node in load_network(report.files[0]).nodes if node.id == "use")
     assert dict(use.content)["copper"] == pytest.approx(0.05, rel=1e-12)
+
+
+@pytest.mark.parametrize("content", [0.05, 0.15])
+def test_contents_of_stocks_are_held_against_the_simulation(tmp_path: Path, content: float) -> None:
+    """Of 5 kt in 100 there are 5 + 1 - 0.4 in 102 a year later; and no flow tells of 1990."""
+    stocks: list[Row] = [["Use", year, "", 100, "kt"] for year in (1990, 1999, 2000)]
+    stocks += [["Use", 1999, "Copper", 5, "%"], ["Use", 2000, "Copper", content, "1"]]
+    assert stored(tmp_path, stocks, dumped=0.4).content_error == pytest.approx(abs(5.6 / 102 - content), abs=3e-4)
+    (tmp_path / "net.toml").unlink()
+    with pytest.raises(
+        CirlError, match=r"0\.04 of 'Use' in 1990 is Copper, but contents .* the end of 1999, and ends .* 2000"
+    ):
+        stored(tmp_path, [*stocks, ["Use", 1990, "Copper", 4, "%"]])
+
+
+def test_stocks_of_some_regions_say_what_is_in_them(tmp_path: Path) -> None:
+    """Where nothing is told the content is that of what leaves."""
+    rows = [
+        [*ends, 2000, name, value, unit, "", region]
+        for region in "AB"
+        for ends in (("Mine", "Use"), ("Use", "Dump"))
+        for name, value, unit in (("", 10, "kt/year"), ("Copper", 2, "%"))
+    ]
+    stocks = [
+        ["A", "Use", 1999, "", 100, "kt"],
+        ["A", "Use", 1999, "Copper", 5, "%"],
+        ["B", "Use", 1999, "", 900, "kt"],
+    ]
+    beside = table(tmp_path / "stocks.csv", stocks, ["region", *LONG])
+    flows = table(tmp_path / "flows.csv", rows, [*HEADER, "region"])
+    import_flows(flows, tmp_path / "net.toml", beside, roles=ROLES, stores=["Use"])
+    contents = [dict(load_network(f"{tmp_path / 'net.toml'}:{region}").stores[1].content) for region in "ab"]
+    assert contents == [{"copper": pytest.approx(0.05)}, {"copper": pytest.approx(0.02)}]
 
 
 def test_all_of_a_stock_is_all_of_it(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated
@@ -10,13 +10,14 @@ from typing import Annotated
 import numpy as np
 
 from cirl_marl.controllers.basic import Neutral
-from cirl_marl.controllers.rollout import episode_start
+from cirl_marl.controllers.rollout import Rollout, episode_start
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.importing.balances import Change, Processes, ProcessKind, Reconciliation, Residual
 from cirl_marl.importing.definition import DefinitionWriter, ImportedFiles, identifiers
 from cirl_marl.importing.flow_table import FlowTable, StockKey, read_flows, read_stocks
+from cirl_marl.network import Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Role
 from cirl_marl.records.files import publish_folder, write_table
@@ -27,6 +28,9 @@ NOTICEABLE = 1e-6
 """Part of the largest flow of a region below which the content of a flow does not count."""
 WRONG = 1e-5
 """Part of the largest flow of a region by which a simulated flow may miss the table."""
+
+StockContents = Mapping[str, Mapping[StockKey, float]]
+"""What part of stocks each substance is, by its name."""
 
 Ask = Callable[[str, ProcessKind], Role]
 """Returns the role of a source or a sink."""
@@ -42,7 +46,7 @@ class ImportReport:
     reconciliation: Annotated[Reconciliation | None, "how flows were adjusted; None if they balanced"]
     stock_mistakes: Annotated[Mapping[str, float], "by store how far its stocks and flows are apart at most, mass"]
     largest_error: Annotated[float, "largest difference between a simulated flow and the table, mass/time"]
-    content_error: Annotated[float, "largest difference between a simulated content and the table, as stores mix"]
+    content_error: Annotated[float, "largest difference between a simulated content and the tables, as stores mix"]
     files: Annotated[tuple[Path, ...], "what was written, the definition first"]
 
     @property
@@ -105,7 +109,7 @@ def import_flows(
     table = Processes(table, holders).mix_substances()
     processes = Processes(table, holders)
     _check_stores(processes, stores)
-    _check_stock_contents(stocks, processes, contents)
+    _check_stock_contents(stocks, table, processes, contents)
     reconciliation: Reconciliation | None = None
     residuals = processes.residuals
     if not reconcile:
@@ -139,7 +143,7 @@ def import_flows(
     with publish_folder(out.parent) as partial:
         files = _write(partial, out.name, name, definition, changes)
         try:
-            error, content_error = _largest_errors(partial / out.name, table, processes, definition, progress)
+            error, content_error = _largest_errors(partial / out.name, table, processes, contents, definition, progress)
         except CirlError as failure:
             raise CirlError(str(failure).replace(str(partial), str(out.parent))) from failure
     mistakes = processes.stock_mistakes(known_stocks)
@@ -180,10 +184,8 @@ def _matching_processes(table: FlowTable, patterns: Sequence[str], label: str) -
     return list(dict.fromkeys(processes))
 
 
-def _check_stock_contents(
-    path: Path | None, processes: Processes, contents: Mapping[str, Mapping[StockKey, float]]
-) -> None:
-    """Refuse contents of stocks that flows alone decide.
+def _check_stock_contents(path: Path | None, table: FlowTable, processes: Processes, contents: StockContents) -> None:
+    """Refuse contents of stocks that flows alone decide, and of years that are not those of the flows.
 
     Raises:
         CirlError: naming the table, the substance and the process.
@@ -192,10 +194,15 @@ def _check_stock_contents(
         ProcessKind.SOURCE: "is a source, and has what leaves it; give the content of its flows",
         ProcessKind.SINK: "is a sink, and is empty at the start; leave it out",
     }
+    before, last = table.years[0] - 1, table.years[-1]
     for substance, parts in contents.items():
         for (_, process, year), part in parts.items():
+            subject = f"{path}: {part:.4g} of '{process}' in {year} is {substance}, but"
             if remedy := remedies.get(processes.kinds[process]):
-                raise CirlError(f"{path}: {part:.4g} of '{process}' in {year} is {substance}, but it {remedy}")
+                raise CirlError(f"{subject} it {remedy}")
+            if not before <= year <= last:
+                years = f"the start, the end of {before}, and ends of years to {last}"
+                raise CirlError(f"{subject} contents of stocks are of {years}; leave it out")
 
 
 def _stock_processes(table: FlowTable, stocks: Mapping[tuple[str, str, int], float]) -> list[str]:
@@ -263,10 +270,11 @@ def _largest_errors(
     path: Path,
     table: FlowTable,
     processes: Processes,
+    stock_contents: StockContents,
     definition: ImportedFiles,
     progress: Callable[[float], None],
 ) -> tuple[float, float]:
-    """Simulate every region without agents, and return how far a flow, and a content, is from the table.
+    """Simulate every region without agents, and return how far a flow, and a content, is from the tables.
 
     Raises:
         CirlError: for a flow that the network does not give back, or without stores a content.
@@ -297,10 +305,24 @@ def _largest_errors(
             errors = np.abs(amounts - table.substances.amounts[:, done])
             flows_of_year = np.maximum(table_flows, NOTICEABLE * table_flows.max())
             s, y, k = np.unravel_index(int((errors / flows_of_year).argmax()), errors.shape)
-            worst_content = max(worst_content, float((errors / flows_of_year)[s, y, k]))
+            of_stocks = _content_errors(network, run, table, processes, stock_contents, region)
+            worst_content = max(worst_content, float((errors / flows_of_year)[s, y, k]), *of_stocks)
             sizes = table.substances.amounts[:, done].max(axis=(1, 2), keepdims=True)
             if (errors > WRONG * sizes).any() and not processes.of(ProcessKind.STORE):
                 flow = f"{table.substances.names[s]} of {[*definition.arcs][k]} in {table.years[y]}"
                 raise CirlError(f"{table.name}: the network does not give back {flow}; does it balance?")
         progress((done + 1) / len(ids))
     return worst, worst_content
+
+
+def _content_errors(
+    network: Network, run: Rollout, table: FlowTable, processes: Processes, contents: StockContents, region: str
+) -> Iterator[float]:
+    """Yield how far stocks of a region are, at the ends of years, from the contents that a table has."""
+    assert table.substances is not None
+    nodes = identifiers(processes.names)
+    for s, substance in enumerate(table.substances.names):
+        for (region_of_stock, process, year), part in contents.get(substance, {}).items():
+            if region_of_stock == region and year in table.years:
+                place = table.years.index(year), s, network.node_index[nodes[process]]
+                yield abs(float(run.contents[place]) - part)

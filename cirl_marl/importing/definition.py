@@ -294,10 +294,9 @@ class DefinitionWriter:
         for substance, content in self._contents(self._pairs_from(process)).items():
             of_stocks = self.stock_contents.get(self._substance_names[substance], {})
             keys = [(region, process, before) for region in self.table.regions]
-            if of_stocks.keys() >= {*keys}:
-                contents[substance] = np.array([of_stocks[key] for key in keys]), self.source
-            else:
-                contents[substance] = content[:, 0], outflow_text
+            parts = [of_stocks.get(key, part) for key, part in zip(keys, content[:, 0].tolist(), strict=True)]
+            texts = dict.fromkeys(self.source if key in of_stocks else outflow_text for key in keys)
+            contents[substance] = np.array(parts), "; ".join(texts)
         return contents
 
     def _stated_contents(self, source: str) -> Iterator[str]:

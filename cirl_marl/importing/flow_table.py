@@ -161,7 +161,10 @@ def _read_flows(path: Path, sheet: str | None, default_unit: str | None, default
         return table
     labels, stated_flows = list(map(str, table.pairs)), table.grid(table.values, np.nan)
     found = substances.flows(stated_flows, table.years[0], table.unit, unit, table.regions, labels)
-    return replace(table, substances=found.non_zero())
+    for place, name in enumerate(found.names):
+        if not found.amounts[place].any():
+            raise CirlError(f"{path}: no flow has any {name}; leave its rows out, or correct them")
+    return replace(table, substances=found)
 
 
 def _per_year(table: FlowTable) -> FlowTable:
