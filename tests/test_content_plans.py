@@ -326,6 +326,17 @@ def test_mpc_delivers_what_some_actions_deliver(seed: int, horizon: int | None) 
     assert controlled.accounts[0, 0] <= run.accounts[0, 0]
 
 
+@pytest.mark.medium
+@pytest.mark.parametrize("seed", [0, 1])
+def test_mpc_delivers_contents_whose_prices_the_bound_does_not_know(seed: int) -> None:
+    """As much as constant actions do, though prices have to rise a hundredfold, one after the other."""
+    network = with_substances(random_network(1806943563, 3, 7), 1377318852)
+    plan, rng = bound(network), np.random.default_rng(seed)
+    run = simulate_plan(replace(plan, actions=np.tile(rng.uniform(-1, 1, plan.actions.shape[1]), (4, 1))))
+    demand = np.maximum(run.episode_levels[0] - 1e-6, 0.0)
+    assert (controlled_by_mpc(network, None, demand).episode_levels[0] >= demand - 2e-4).all()
+
+
 def test_windows_weigh_accounts_as_the_simulator_does() -> None:
     """What other actions change of the objective of a window is what its rates and charges say."""
     network = booked()

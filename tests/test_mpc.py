@@ -117,6 +117,20 @@ def test_a_plan_that_falls_short_of_its_promise_is_corrected_again(
     assert plan is not None and plan.merit == max(merits)
 
 
+def test_what_serves_less_takes_no_place_however_cheap() -> None:
+    """Where demands have to be met; where what lacks has its price, that decides."""
+    env = MultiAgentVectorEnv(in_use(), num_envs=1)
+    env.reset(seed=0)
+    controller = MPC(min_service=0.9)
+    controller.start(env, 0)
+    plan, planner = controller._plans[0].window, controller._planner
+    assert plan is not None and plan.task.has_to_serve
+    free, idle = planner.at_price(plan, np.zeros(1)), [-np.ones_like(plan.actions)]
+    assert planner.better_of(free, idle) is free
+    priced = replace(free, task=replace(free.task, is_redrawn=True))
+    assert planner.better_of(priced, idle).value > free.value
+
+
 def test_a_service_out_of_reach_is_approached() -> None:
     """From a stock of 2 a level of 1 throughout cannot be had: all is mined until the stock is there, then kept."""
     run = rollout(

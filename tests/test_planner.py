@@ -137,6 +137,27 @@ def test_the_program_of_a_step_is_the_episode_to_first_order(lives: bool) -> Non
         assert not moved[len(place) :].any()
 
 
+def test_a_step_that_promises_nothing_is_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Around the best plan, a valve that stays shut, one program is enough: a smaller region promises no more."""
+    solved, best_values = list[Floats | None](), solver.best_values
+
+    def counted(*arguments: Any) -> Floats | None:
+        solved.append(best_values(*arguments))
+        return solved[-1]
+
+    valve = Control(kind=ControlKind.RATE, low=0.5, neutral=2.0, high=2.0)
+    nodes = (
+        Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR, initial=(100.0, 100.0)),
+        Node(id="use", initial=(1.0, 1.0)),
+    )
+    arc = Arc(id="mined", donor="mine", recipient="use", rate=0.4, control=valve)
+    network = Network(name="valve", nodes=nodes, arcs=(arc,), episode=Episode(control_interval=0.5, horizon=4))
+    monkeypatch.setattr(improve, "best_values", counted)
+    plan = improve_plan(bound(network))
+    assert len(solved) == 1
+    np.testing.assert_allclose(plan.actions, -1.0, atol=1e-6)
+
+
 def test_a_step_is_corrected_until_services_are_kept() -> None:
     """What a step to first order lacks of a service is made up for by what its own episode says, in the same round."""
     found = bound("copper_net", min_service=0.99, horizon=40, degree=1)
@@ -160,6 +181,9 @@ def test_the_best_of_a_round_counts_and_what_it_lacks_is_asked_for(monkeypatch: 
 
     class Step(SimpleNamespace):
         problem, scale, action = None, None, np.arange(found.actions.size).reshape(found.actions.shape)
+
+        def promise(self, values: Floats) -> float:
+            return 1.0
 
         def with_correction(self, *about: object) -> SimpleNamespace:
             corrected.append(self)

@@ -51,8 +51,12 @@ LEAP = 2.0
 """Half-width of the trust region, all of the range, of a step to what is not made any more, as it is too impure."""
 DEARER = 10.0
 """By what the price of a service rises that lacks where no step helps: beside contents the bound knows too low ones."""
+PATIENCE = 3
+"""By what the rounds are multiplied that there may be beside contents while services lack: prices rise one by one."""
 STALL = 0.05
 """Part of what is charged for services that lack, which a step has to gain if the price is to stay beside contents."""
+NO_PROMISE = 1e-10
+"""Part of the objective that a step has to promise, to be tried: one within a smaller region promises even less."""
 TOLERATED_SHORTFALL = 1e-4
 """What a service may lack of its demand without a further round: a hundredth of a gap of 1 %."""
 
@@ -137,7 +141,7 @@ def climb(
         plan: with the actions to start from.
         trials: of plans like it.
         price: what is charged for a unit that each service lacks, and by which each budget is exceeded.
-        rounds: most linear programs to solve.
+        rounds: most linear programs to solve, PATIENCE times as many while services lack beside contents.
         enough: asked of each episode that is better than those before, whether to stop there.
         progress: called with the share of rounds that are done.
     """
@@ -146,8 +150,10 @@ def climb(
     best, run = plan, trials.simulate(plan)
     value, trust, slopes = trials.value(run, price), TRUST, None
     is_cheap, is_leap = any(service.substance for service in plan.network.services), False
-    for done in range(rounds):
+    for done in range(PATIENCE * rounds if is_cheap else rounds):
         is_lacking = demand - run.episode_levels[0] > TOLERATED_SHORTFALL
+        if done >= rounds and not is_lacking.any():
+            break
         if trust < SMALLEST and is_cheap and is_lacking.any():
             is_leap = not is_leap
             trust = LEAP
@@ -171,6 +177,9 @@ def climb(
             values = best_values(corrected.problem, corrected.scale)
             if values is None:  # a smaller region is another program
                 break
+            if corrected is program and program.promise(values) <= NO_PROMISE * abs(value):
+                trust = 0.0
+                break
             actions = np.clip(best.actions + values[program.action], -1.0, 1.0)
             trial = trials.simulate(_with_actions(best, actions))
             more = trials.value(trial, price) - value
@@ -181,7 +190,7 @@ def climb(
             if gain > 0 and _shortage(demand, aims, trial) <= TOLERATED_SHORTFALL:
                 break
             corrected = program.with_correction(values, run, trial)
-        progress((done + 1) / rounds)
+        progress(min(1.0, (done + 1) / rounds))
         if gain > 0:
             best, run = _with_actions(best, better[0]), better[1]
             lack = np.maximum(demand - run.episode_levels[0], 0.0)  # a step lacks about what the last one did

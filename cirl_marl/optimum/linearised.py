@@ -113,6 +113,10 @@ class StepProgram:
     contents: Annotated[list[int], "rows of ``measure`` that are of contents, which it does not read"]
     aims: Annotated[Aims, "whose budgets the last rows of G keep"]
 
+    def promise(self, values: Floats) -> float:
+        """Return by how much the objective gets better, to first order, by a solution."""
+        return float(self.problem.cost @ (self.origin - values))
+
     def with_correction(self, values: Floats, run: EpisodeRecord, trial: EpisodeRecord) -> StepProgram:
         """Return the program with what an episode was away from what its solution promised: a second-order correction.
 
