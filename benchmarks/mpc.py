@@ -23,7 +23,8 @@ from cirl_marl import MPC, MultiAgentVectorEnv, Network, load_network
 from cirl_marl.controllers.rollout import episode_start
 from cirl_marl.optimum import bound, gap
 
-NAMES = ("steel_japan", *CYCLES)
+NAMES = ("steel_japan", *CYCLES, "steel_japan.copper", "aluminium_world.alloys")
+"""Of the catalogue, with a scenario behind a point."""
 WORLD = "steel_world"
 WINDOWS: tuple[int | None, ...] = (6, 10, None)
 GENERATED_WINDOWS: tuple[int | None, ...] = (6, None)
@@ -57,7 +58,8 @@ class Outcome:
 def outcomes(name: str) -> Iterator[Outcome]:
     """Run MPC from the middle of the initial ranges, and hold it against the bound at the levels that it delivers."""
     seed = name.removeprefix(GENERATED) if name.startswith(GENERATED) else ""
-    network: Network = yearly_network(int(seed)) if seed else load_network(name)
+    base, _, scenario = name.partition(".")
+    network: Network = yearly_network(int(seed)) if seed else load_network(base, scenario=scenario or None)
     demanded = GENERATED_SERVICE if seed else SERVICE
     proof = None
     for window in GENERATED_WINDOWS if seed else WINDOWS[: 1 if name == WORLD else None]:
