@@ -222,6 +222,15 @@ def test_steps_of_plans_have_what_pieces_change_by() -> None:
     assert (moves >= program.problem.low - 1e-9).all() and (moves <= program.problem.high + 1e-9).all()
 
 
+def test_excesses_of_a_step_are_measured_by_their_amounts() -> None:
+    """So the unit of mass makes no difference to the solver."""
+    network = technologies()
+    program = small_step(bound(network, aim="cost", min_service=0.5), 0.5)[1]
+    amounts = Ledger(network).amounts
+    assert sorted(set(amounts.ravel().tolist())) == [20.0, 40.0, 50.0, 80.0]
+    np.testing.assert_array_equal(program.scale[program.part], np.tile(amounts.T, (STEPS, 1)))
+
+
 def test_a_step_leaves_rates_as_they_are() -> None:
     """Programs of several steps have the same rates, in which what is held counts once."""
     network = market()
