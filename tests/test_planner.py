@@ -198,7 +198,8 @@ def test_the_best_of_a_round_counts_and_what_it_lacks_is_asked_for(monkeypatch: 
 
     steps = (np.full(found.actions.size, step) for step in 0.001 * 2.0 ** np.arange(5))
     monkeypatch.setattr(improve, "simulate_plan", episode)
-    monkeypatch.setattr(improve, "jacobians", lambda plan, dynamics, first: ())
+    slopes = SimpleNamespace(supplies=SimpleNamespace(services=()))
+    monkeypatch.setattr(improve, "jacobians", lambda plan, dynamics, first: slopes)
     monkeypatch.setattr(improve, "step_program", program)
     monkeypatch.setattr(improve, "best_values", lambda problem, scale: next(steps))
     monkeypatch.setattr(improve, "penalised_objective", lambda bound, run, prices: run.worth)

@@ -206,10 +206,10 @@ class Supply:
                 if terms is None:
                     part = dynamics.advance(*inputs)
                     done = part if done is None or len(copies) == batch else _with_copies(done, copies, part)
-                    base[:, copies] = self._quantities(part.stock, part.moved_mass)
+                    base[:, copies] = self.quantities(part.stock, part.moved_mass)
                 else:
                     estimate = dynamics.estimate(*inputs, terms=terms, flows=self._reads_flows)
-                    base[:, copies] = self._quantities(*estimate)
+                    base[:, copies] = self.quantities(*estimate)
                 shortage = demand - base
                 gap = np.where(np.where(shortage > 0, supply < range_.most, supply > 0), np.abs(shortage), 0.0)
                 is_wrong = open_ & (gap > CLOSE * demand).any(axis=0)
@@ -287,11 +287,11 @@ class Supply:
         amounts = range_.amounts(range_.extents(supply)[self.of])
         controls[self.rows] = np.where(idle, amounts, controls[self.rows])
         done = self._dynamics.advance(stock, inner, controls, step, factors)
-        change = self._quantities(done.stock, done.moved_mass) - base
+        change = self.quantities(done.stock, done.moved_mass) - base
         slope = np.divide(change, shift, out=np.zeros_like(change), where=shift != 0)
         return np.ascontiguousarray(slope.reshape(services, batch, services).transpose(1, 0, 2))
 
-    def _quantities(self, stock: Floats, moved_mass: Floats | None) -> Floats:
+    def quantities(self, stock: Floats, moved_mass: Floats | None) -> Floats:
         """Return what the services measure at the end of an interval, shape (services, B)."""
         of_stocks, of_flows = self.measures
         measured = of_stocks(self._dynamics.rows.stocks(stock))

@@ -24,7 +24,15 @@ from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
 from cirl_marl.optimum.aims import Aims, RateTables
 from cirl_marl.optimum.bounds import Bound
-from cirl_marl.optimum.linearised import MOST_SLOPES, ActionPlan, Later, jacobians, slopes_of, step_program
+from cirl_marl.optimum.linearised import (
+    MOST_SLOPES,
+    ActionPlan,
+    Later,
+    StepProgram,
+    jacobians,
+    slopes_of,
+    step_program,
+)
 from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.planned_episodes import simulate_plan
 from cirl_marl.optimum.program import Programs
@@ -50,11 +58,11 @@ the optimum of Haverly's second pooling problem, of as many uniform ones 3."""
 LEAP = 2.0
 """Half-width of the trust region, all of the range, of a step to what is not made any more, as it is too impure."""
 DEARER = 10.0
-"""By what the price of a service rises that lacks where no step helps: beside contents the bound knows too low ones."""
-PATIENCE = 3
-"""By what the rounds are multiplied that there may be beside contents while services lack: prices rise one by one."""
+"""By what prices of what is short rise where no step helps: beside contents and budgets the bound knows low ones."""
 STALL = 0.05
-"""Part of what is charged for services that lack, which a step has to gain if the price is to stay beside contents."""
+"""Part of what is charged for what is short, which a step has to gain if prices are to stay there."""
+EXTENSION = 3
+"""Times the usual rounds, of which there may be as many beside contents and budgets while something is short."""
 NO_PROMISE = 1e-10
 """Part of the objective that a step has to promise, to be tried: one within a smaller region promises even less."""
 TOLERATED_SHORTFALL = 1e-4
@@ -135,13 +143,14 @@ def climb(
 ) -> tuple[P, Floats]:
     """Return a plan with better actions, by linear programs around episodes, from its own, and the last prices.
 
-    The price of a service rises that lacks where contents are demanded and no step helps.
+    Where contents are demanded or there are budgets, prices rise of what is short and no step helps.
 
     Args:
         plan: with the actions to start from.
         trials: of plans like it.
         price: what is charged for a unit that each service lacks, and by which each budget is exceeded.
-        rounds: most linear programs to solve, PATIENCE times as many while services lack beside contents.
+        rounds: most steps, in each of which a few programs are solved; EXTENSION times as many beside contents and
+            budgets while something is short.
         enough: asked of each episode that is better than those before, whether to stop there.
         progress: called with the share of rounds that are done.
     """
@@ -149,60 +158,86 @@ def climb(
     lack, excess = np.zeros(len(demand)), np.zeros(len(aims.budgets))
     best, run = plan, trials.simulate(plan)
     value, trust, slopes = trials.value(run, price), TRUST, None
-    is_cheap, is_leap = any(service.substance for service in plan.network.services), False
-    for done in range(PATIENCE * rounds if is_cheap else rounds):
-        is_lacking = demand - run.episode_levels[0] > TOLERATED_SHORTFALL
-        if done >= rounds and not is_lacking.any():
+    has_contents, is_leap = any(service.substance for service in plan.network.services), False
+    is_cheap = has_contents or bool(aims.budgets)
+    nearest, nearest_shortfall = plan, max(_shortage(demand, aims, run), TOLERATED_SHORTFALL)
+    shortfall = nearest_shortfall
+    for done in range(EXTENSION * rounds if is_cheap else rounds):
+        is_short = np.append(demand - run.episode_levels[0], aims.excess(run) / aims.sizes) > TOLERATED_SHORTFALL
+        if done >= rounds and not is_short.any():
             break
-        if trust < SMALLEST and is_cheap and is_lacking.any():
-            is_leap = not is_leap
+        if trust < SMALLEST and is_cheap and is_short.any():
+            is_leap = has_contents and not is_leap
             trust = LEAP
             if not is_leap:
-                price[: len(demand)][is_lacking] *= DEARER
+                price[is_short] *= DEARER
                 value, trust = trials.value(run, price), TRUST
         if trust < SMALLEST or enough(run):
             break
         slopes = jacobians(best, dynamics, trials.first) if slopes is None else slopes
         wanted, limits = np.minimum(demand + lack, 1.0), aims.limits - excess
-        program = step_program(
-            *(best, dynamics, run, wanted, price, trust, slopes),
-            limits=limits,
-            is_leap=is_leap,
-            first=trials.first,
-            later=trials.later,
-            rates=trials.rates,
-        )
-        corrected, gain = program, 0.0
-        for _ in range(1 + CORRECTIONS):
-            values = best_values(corrected.problem, corrected.scale)
-            if values is None:  # a smaller region is another program
-                break
-            if corrected is program and program.promise(values) <= NO_PROMISE * abs(value):
-                trust = 0.0
-                break
-            actions = np.clip(best.actions + values[program.action], -1.0, 1.0)
-            trial = trials.simulate(_with_actions(best, actions))
-            more = trials.value(trial, price) - value
-            if more > gain:
-                better, gain = (actions, trial), more
-            elif gain > 0:
-                break
-            if gain > 0 and _shortage(demand, aims, trial) <= TOLERATED_SHORTFALL:
-                break
-            corrected = program.with_correction(values, run, trial)
-        progress(min(1.0, (done + 1) / rounds))
-        if gain > 0:
-            best, run = _with_actions(best, better[0]), better[1]
+        steps = list[_Step | None]()
+        for is_held in (False, True) if len(slopes.supplies.services) else (False,):
+            program = step_program(
+                *(best, dynamics, run, wanted, price, trust, slopes),
+                limits=limits,
+                is_leap=is_leap,
+                first=trials.first,
+                later=trials.later,
+                rates=trials.rates,
+                is_held=is_held,
+            )
+            steps.append(_corrected_step(program, best, run, trials, price, value))
+        progress(min((done + 1) / rounds, 1.0))
+        step = max(filter(None, steps), key=lambda each: each.gain, default=_Step(best, run, 0.0))
+        if step.gain > 0:
+            best, run = step.plan, step.run
             lack = np.maximum(demand - run.episode_levels[0], 0.0)  # a step lacks about what the last one did
             excess = aims.excess(run)
-            value, slopes = value + gain, None
-            is_stalled = is_cheap and gain < STALL * float(price[: len(demand)] @ lack)
+            shortfall = max(_shortage(demand, aims, run), TOLERATED_SHORTFALL)
+            if shortfall <= nearest_shortfall:  # at other prices less may be kept later
+                nearest, nearest_shortfall = best, shortfall
+            value, slopes = value + step.gain, None
+            is_stalled = is_cheap and step.gain < STALL * float(price @ np.append(lack, excess))
             trust = 0.0 if is_stalled else min(1.0, 2 * trust)
             is_leap = is_leap and is_stalled
         else:
-            trust = 0.0 if is_leap else trust / 4
+            trust = 0.0 if is_leap or not any(steps) else trust / 4
     progress(1.0)
-    return best, price
+    return (nearest if aims.budgets and shortfall > nearest_shortfall else best), price
+
+
+@positional_record
+class _Step:
+    """The best plan of a step and of its corrections."""
+
+    plan: Any
+    run: Annotated[Any, "its episode"]
+    gain: Annotated[float, "of the value at the prices"]
+
+
+def _corrected_step(
+    program: StepProgram, plan: P, run: Any, trials: Trials, price: Floats, value: float
+) -> _Step | None:
+    """Return the best of a step around a plan and of its corrections; None if the step promises nothing."""
+    best, corrected = _Step(plan, run, 0.0), program
+    for _ in range(1 + CORRECTIONS):
+        values = best_values(corrected.problem, corrected.scale)
+        if values is None:  # a smaller region is another program
+            break
+        if corrected is program and program.promise(values) <= NO_PROMISE * abs(value):
+            return None
+        moved = _with_actions(plan, np.clip(plan.actions + values[program.action], -1.0, 1.0))
+        trial = trials.simulate(moved)
+        gain = trials.value(trial, price) - value
+        if gain > best.gain:
+            best = _Step(moved, trial, gain)
+        elif best.gain > 0:
+            break
+        if best.gain > 0 and _shortage(trials.demand, plan.aims, trial) <= TOLERATED_SHORTFALL:
+            break
+        corrected = program.with_correction(values, run, trial)
+    return best
 
 
 def _with_actions(plan: P, actions: Floats) -> P:

@@ -2,6 +2,7 @@
 
 Every interval is linear to first order around an episode, δx' = J_x δx + J_a δa, and so are mean flows. The Jacobians
 are difference quotients of the simulator, so that cuts of flows and supplies that make up for services are in them.
+Beside budgets such supplies are held in these, and change as actions do (``step_supplies``).
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from cirl_marl.optimum.aims import Aims, EpisodeRecord, RateTables, over
 from cirl_marl.optimum.planned_episodes import HasPlan
 from cirl_marl.optimum.program import LinearProgram
 from cirl_marl.optimum.step_parts import Efforts, Excesses, account_shares
+from cirl_marl.optimum.step_supplies import IdleSupplies
 from cirl_marl.optimum.window_simulator import WindowSimulator, service_measures
 
 DIFFERENCE = 1e-6
@@ -61,42 +63,59 @@ class Later:
     level_cost: Annotated[Floats, "of levels, shape (steps, services)"]
 
 
-def jacobians(plan: ActionPlan, dynamics: Dynamics, first: int = 0) -> tuple[Floats, Floats, Floats]:
-    """Return ∂(x', f̄)/∂x and ∂(x', f̄)/∂a of every interval from the first, and what each ends with, around a plan.
+@positional_record
+class Slopes:
+    """∂(x', f̄)/∂x and ∂(x', f̄)/∂(a, U) of the intervals of an episode, and what each ends with.
 
-    Shapes are (steps, rows, stocks), (steps, rows, entries) and (steps, rows); stocks are those of the simulator, by
-    stage where there is a lifetime. Rows are stocks x', mean flows f̄ and those of each substance.
+    Stocks are those of the simulator, by stage where there is a lifetime. Rows are stocks x', mean flows f̄ and those of
+    each substance.
     """
+
+    by_stock: Annotated[Floats, "shape (steps, rows, stocks)"]
+    by_action: Annotated[Floats, "shape (steps, rows, entries + supplies)"]
+    end: Annotated[Floats, "shape (steps, rows)"]
+    supplies: Annotated[IdleSupplies, "U of each interval"]
+
+
+def jacobians(plan: ActionPlan, dynamics: Dynamics, first: int = 0) -> Slopes:
+    """Return the slopes of every interval from the first, around a plan."""
     network = plan.network
     steps, entries = plan.actions.shape
     rows, nodes = dynamics.rows, dynamics.rows.nodes.stop
     stock = WindowSimulator(network, plan.agents).run(plan.initial, plan.actions, first)[0]
-    inputs = np.concatenate([stock[:-1], plan.actions], axis=1)
+    actuators, interval = Actuators(network, plan.agents or None, steps), np.arange(first, first + steps)
+    controls = actuators.controls(np.ascontiguousarray(plan.actions.T), interval)
+    supply = Supply(dynamics)
+    idle, is_held = supply.idle(actuators.agents), bool(plan.aims.budgets)
+    supplies = IdleSupplies.of(dynamics, supply, idle & is_held, dynamics.extend(stock[:-1].T), controls, first)
+    inputs, brought = np.concatenate([stock[:-1], plan.actions], axis=1), len(supplies.services)
+    count = nodes + entries + brought
     scale = np.array([node.scale for node in dynamics.staged_network.stores])
     width = np.concatenate([np.maximum(stock.max(axis=0), scale), np.ones(entries)]) * DIFFERENCE
-    # forward in stocks, which may be 0; inward in actions, which may be at a bound
+    # forward in stocks, which may be 0; inward in actions, which may be at a bound, and in what is brought
     # one batch simulates all difference quotients of all intervals: column (t, j) has input j of interval t shifted
     shift = np.where(np.arange(nodes + entries) < nodes, 1.0, -np.where(inputs >= 0, 1.0, -1.0)) * width
-    columns = np.repeat(inputs[:, :, None], nodes + entries + 1, axis=2)
+    inward = np.where(supplies.high > -supplies.low, 1.0, -1.0) * DIFFERENCE * np.maximum(supplies.size, TINY)
+    columns = np.repeat(inputs[:, :, None], count + 1, axis=2)
     columns[:, np.arange(nodes + entries), np.arange(nodes + entries)] += shift
     flat = np.ascontiguousarray(columns.transpose(1, 0, 2).reshape(nodes + entries, -1))
-    actuators = Actuators(network, plan.agents or None, flat.shape[1])
-    interval = np.repeat(np.arange(first, first + steps), nodes + entries + 1)
-    inner = np.empty((0, flat.shape[1]))
-    stocks, supply = dynamics.extend(flat[:nodes]), Supply(dynamics)
-    _, done = supply.advance(
-        stocks, inner, actuators.controls(flat[nodes:], interval), interval, supply.idle(actuators.agents)
-    )
+    interval = np.repeat(interval, count + 1)
+    controls = Actuators(network, plan.agents or None, flat.shape[1]).controls(flat[nodes:], interval)
+    held = np.repeat(supplies.controls[:, :, None], count + 1, axis=2)
+    held[:, :, nodes + entries : count] += (supplies.unit * inward.T[:, None]).transpose(1, 2, 0)
+    controls[supplies.rows] = held.reshape(len(held), flat.shape[1])
+    stocks, inner = dynamics.extend(flat[:nodes]), np.empty((0, flat.shape[1]))
+    _, done = supply.advance(stocks, inner, controls, interval, idle & (not is_held))
     flows = np.concatenate([done.moved_mass, done.moved_substances]) / network.episode.control_interval
     outputs = np.concatenate([done.stock[rows.nodes], flows])
     by_interval = outputs.reshape(len(outputs), steps, -1).transpose(1, 0, 2)
-    slopes = (by_interval[:, :, :-1] - by_interval[:, :, -1:]) / shift[:, None]
-    return slopes[:, :, :nodes], slopes[:, :, nodes:], np.ascontiguousarray(by_interval[:, :, -1])
+    slopes = (by_interval[:, :, :-1] - by_interval[:, :, -1:]) / np.concatenate([shift, inward], axis=1)[:, None]
+    return Slopes(slopes[:, :, :nodes], slopes[:, :, nodes:], np.ascontiguousarray(by_interval[:, :, -1]), supplies)
 
 
 @positional_record
 class StepProgram:
-    """The program of the best step: δa, levels, imbalance and changes of convex parts of intervals, lacks, excesses.
+    """The program of the best step: δa, δU, levels, imbalance, changes of convex parts of intervals, lacks, excesses.
 
     Convex parts are charged distances of controls, and what rates in pieces have excesses of.
     """
@@ -105,6 +124,7 @@ class StepProgram:
     scale: Annotated[Floats, "measure of each variable, shape (variables,)"]
     origin: Annotated[Floats, "its variables if nothing changes, likewise"]
     action: Annotated[Integers, "columns of δa, shape (steps, entries)"]
+    supply: Annotated[Integers, "columns of what idle supplies change by, shape (steps, supplies)"]
     part: Annotated[Integers, "columns of what convex parts change by, shape (steps, parts)"]
     level: Annotated[Integers, "columns of the levels, shape (steps, services)"]
     lack: Annotated[Integers, "columns of what services lack and budgets are exceeded by, (services + budgets,)"]
@@ -128,7 +148,8 @@ class StepProgram:
         step, row = self.measured.T
         before, after = (np.concatenate([each.stock, each.flow], axis=1) @ self.measure.T for each in (run, trial))
         moves = np.zeros(len(values))
-        moves[self.action], moves[self.part] = values[self.action], values[self.part]
+        for columns in (self.action, self.supply, self.part):
+            moves[columns] = values[columns]
         limits = self.problem.under_to.copy()
         correction = (after - before)[step, row] + self.problem.under[: len(row)] @ moves
         limits[: len(row)] += np.where(np.isin(row, self.contents), 0.0, correction)
@@ -144,13 +165,14 @@ def step_program(
     demand: Floats,
     price: Floats,
     trust: float,
-    slopes: tuple[Floats, Floats, Floats],
+    slopes: Slopes,
     margin: Floats | float = 0.0,
     limits: Floats | None = None,
     is_leap: bool = False,
     first: int = 0,
     later: Later | None = None,
     rates: tuple[RateTables, RateTables] | None = None,
+    is_held: bool = False,
 ) -> StepProgram:
     """Return the program of the best change of the actions within a trust region, to first order.
 
@@ -173,10 +195,13 @@ def step_program(
         first: interval of the network in which the plan begins.
         later: what comes after it.
         rates: of the accounts that are weighed, and of the budgets, over its intervals; None: those of the network.
+        is_held: whether idle supplies that bring something go on to bring just what is needed, and others nothing.
     """
     network, limits = plan.network, plan.aims.limits if limits is None else limits
     steps, entries = plan.actions.shape
-    state, services, is_absolute = slopes[2], len(network.services), network.objective.net_zero == "abs"
+    state, services, is_absolute = slopes.end, len(network.services), network.objective.net_zero == "abs"
+    supplies = slopes.supplies.held() if is_held else slopes.supplies
+    acts = entries + len(supplies.services)
     period = slice(first, first + steps)
     intervals = range(period.start, period.stop)
     if rates is None:
@@ -189,9 +214,10 @@ def step_program(
     efforts = Efforts.of(plan, is_charged, first)
     excesses = Excesses.of(ledger, dynamics, efforts, plan.initial, state)
     count_efforts = len(efforts.entries)
-    size = entries + services + 1 + count_efforts + len(ledger.excesses)
-    level, imbalance, count = entries, entries + services, size * steps + services + len(limits)
-    step_low, step_high = np.maximum(-trust, -1 - plan.actions), np.minimum(trust, 1 - plan.actions)
+    size = acts + services + 1 + count_efforts + len(ledger.excesses)
+    level, imbalance, count = acts, acts + services, size * steps + services + len(limits)
+    step_low = np.concatenate([np.maximum(-trust, -1 - plan.actions), supplies.low], axis=1)
+    step_high = np.concatenate([np.minimum(trust, 1 - plan.actions), supplies.high], axis=1)
     furthest = np.maximum(-step_low, step_high)
     low = np.array([network.interval_means(service.low)[period] for service in network.services]).reshape(-1, steps)
     low *= 1.0 + margin
@@ -214,8 +240,8 @@ def step_program(
     measured: list[Integers] = []
     rows_of_parts: list[sparse.csr_array] = []
     rights_of_parts: list[Floats] = []
-    for t, response in enumerate(_responses(*slopes[:2])):
-        past = columns[: t + 1, :entries].ravel()
+    for t, response in enumerate(_responses(slopes.by_stock, slopes.by_action)):
+        past = columns[: t + 1, :acts].ravel()
         cost[past] += weights[t] @ response
         if later is not None:
             cost_later[past] += later.cost[t] @ response
@@ -237,11 +263,14 @@ def step_program(
         if is_absolute:
             own[-2:, imbalance], is_near[-2:] = -1.0, True
         near = np.flatnonzero(is_near)
-        block = sparse.csr_array(np.concatenate([table, own[:, entries:]], axis=1)[near])
-        places = np.append(past, columns[t, entries:])[block.indices]
+        block = sparse.csr_array(np.concatenate([table, own[:, acts:]], axis=1)[near])
+        places = np.append(past, columns[t, acts:])[block.indices]
         rows.append(sparse.csr_array((block.data, places, block.indptr), (len(near), count)))
         rights.append(limit[near])
         measured.append(np.stack([np.full_like(near, t), near], axis=1))
+        block, room = supplies.rows_of(t, by_stage[:services] @ response)
+        rows_of_parts.append(sparse.csr_array((block.data, past[block.indices], block.indptr), (len(room), count)))
+        rights_of_parts.append(room)
         if convex.shape[1] > count_efforts:
             moves = furthest[: t + 1].ravel(), efforts.half[t] * furthest[t, efforts.entries]
             block, room, bounds[t, part_bounds] = excesses.rows(t, response, before, *moves)
@@ -261,7 +290,7 @@ def step_program(
     # what is booked − excess ≤ budget
     spent[:, size * steps + services :] = -np.eye(len(limits))
     rows.append(sparse.csr_array(spent))
-    bounds[:, :entries] = np.stack([step_low, step_high], axis=2)
+    bounds[:, :acts] = np.stack([step_low, step_high], axis=2)
     bounds[:, level:imbalance, 1] = 1.0
     most = efforts.half * furthest[:, efforts.entries]
     bounds[:, imbalance + 1 : part_bounds.start] = np.stack([-np.abs(efforts.away), most], axis=2)
@@ -290,8 +319,9 @@ def step_program(
     net_flow = np.abs(run.flow @ imbalances)[:, None]
     largest = max(float(net_flow.max()), network.objective.circularity_scale)
     unchanged = np.zeros(convex.shape)
-    origin = np.concatenate([np.zeros((steps, entries)), run.levels[0].T, net_flow, unchanged], axis=1)
-    scales = [np.tile(np.append(np.ones(entries + services), largest), (steps, 1)), np.maximum(efforts.half, TINY)]
+    origin = np.concatenate([np.zeros((steps, acts)), run.levels[0].T, net_flow, unchanged], axis=1)
+    measures = [np.ones(entries), np.maximum(supplies.size, TINY), np.ones(services), np.array([largest])]
+    scales = [np.tile(np.concatenate(measures), (steps, 1)), np.maximum(efforts.half, TINY)]
     scales.append(np.tile(ledger.amounts.T, (steps, 1)))
     size_of_excess = np.maximum(np.abs(plan.aims.totals(run)), np.abs(limits))
     short = [np.maximum(demand - run.levels[0].mean(axis=1), 0.0), np.maximum(plan.aims.totals(run) - limits, 0.0)]
@@ -300,6 +330,7 @@ def step_program(
         np.concatenate([np.concatenate(scales, axis=1).ravel(), np.ones(services), size_of_excess]),
         np.concatenate([origin.ravel(), *short]),
         columns[:, :entries],
+        columns[:, entries:acts],
         convex,
         columns[:, level:imbalance],
         np.arange(size * steps, count),

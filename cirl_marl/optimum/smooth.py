@@ -24,7 +24,7 @@ from cirl_marl.environments.actuators import Actuators
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum.bounds import Bound
-from cirl_marl.optimum.linearised import MOST_SLOPES, jacobians, slopes_of, step_program
+from cirl_marl.optimum.linearised import MOST_SLOPES, Slopes, jacobians, slopes_of, step_program
 from cirl_marl.optimum.planned_episodes import simulate_plan
 from cirl_marl.optimum.program import LinearProgram
 from cirl_marl.optimum.solver import best_values
@@ -89,7 +89,7 @@ class _Episode:
         self.bound, self.run, self._dynamics = bound, simulate_plan(bound), dynamics
 
     @cached_property
-    def slopes(self) -> tuple[Floats, Floats, Floats]:
+    def slopes(self) -> Slopes:
         return jacobians(self.bound, self._dynamics)
 
 
@@ -183,7 +183,7 @@ def _nearer(
         limits = np.maximum(limits, aims.totals(run))
     plain = replace(centre.bound, service_weight=None)
     price = np.zeros(len(levels) + len(limits))
-    program = step_program(plain, dynamics, run, levels, price, trust, centre.slopes, margin, limits)
+    program = step_program(plain, dynamics, run, levels, price, trust, centre.slopes, margin, limits, is_held=True)
     problem, actions = program.problem, centre.bound.actions
     count, controls, entries = len(program.origin), actions.size, actions.shape[1]
     pick = sparse.csr_array((distance.half.ravel(), (np.arange(controls), program.action.ravel())), (controls, count))

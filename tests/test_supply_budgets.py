@@ -1,0 +1,150 @@
+"""Budgets beside idle supplies: steps of plans know where these begin and end, plans and MPC keep what can be kept."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cirl_marl import (
+    MPC,
+    Account,
+    Arc,
+    Control,
+    ControlKind,
+    Episode,
+    Law,
+    MultiAgentVectorEnv,
+    Network,
+    Node,
+    Objective,
+    Role,
+    Service,
+)
+from cirl_marl.controllers.rollout import rollout
+from cirl_marl.dynamics.integrator import Dynamics
+from cirl_marl.optimum import Bound, bound, improve_plan, simulate_plan
+from cirl_marl.optimum.linearised import jacobians
+
+AGENTS = ("recycle", "exports")
+
+
+def harbour(horizon: int = 12, interval: float = 0.25) -> Network:
+    """Return a stock in use that imports and two mines fill while nobody acts on them; recycling emits, too."""
+
+    def share(name: str, donor: str, recipient: str, ends: tuple[float, float, float], emissions: float) -> Arc:
+        control = Control(kind=ControlKind.SHARE, low=ends[0], neutral=ends[1], high=ends[2])
+        accounts = {"emissions": emissions}
+        return Arc(id=name, donor=donor, recipient=recipient, law=Law.SHARE, control=control, accounts=accounts)
+
+    def supply(name: str, recipient: str, weight: float, low: float, high: float, emissions: float) -> Arc:
+        control = Control(kind=ControlKind.FLOW, low=low, neutral=low, high=high)
+        return Arc(
+            id=name, donor="ore", recipient=recipient, law=Law.CONTROLLED, control=control,
+            makes_up_for="need", weight=weight, accounts={"emissions": emissions},
+        )  # fmt: skip
+
+    return Network(
+        name="harbour",
+        nodes=(
+            Node(id="ore", role=Role.NONRENEWABLE_RESERVOIR),
+            Node(id="market", stores=False),
+            Node(id="use", initial=(117.0, 117.0), rate=0.125),
+            Node(id="scrap", stores=False),
+            Node(id="abroad", role=Role.TECHNOSPHERE, initial=(0.0, 0.0)),
+            Node(id="dump", role=Role.LANDFILL, initial=(0.0, 0.0)),
+        ),
+        arcs=(
+            Arc(id="to_use", donor="market", recipient="use", law=Law.SHARE),
+            Arc(id="old", donor="use", recipient="scrap", law=Law.SHARE),
+            supply("imports", "use", 0.28, 0.0, 20.0, 1.64),
+            supply("mine_a", "market", 0.67, 2.0, 80.0, 1.02),
+            supply("mine_b", "market", 0.05, 2.0, 66.0, 1.63),
+            share("recycle", "scrap", "market", (0.09, 0.6, 0.95), 0.44),
+            Arc(id="lost", donor="scrap", recipient="dump", law=Law.SHARE, accounts={"emissions": 0.04}),
+            share("exports", "market", "abroad", (0.027, 0.029, 0.31), 0.0),
+        ),
+        services=(Service(id="need", provider="use", quantity="stock", low=108.0),),
+        episode=Episode(horizon=horizon, control_interval=interval),
+        accounts=(Account(id="emissions", unit="Mt CO2e"),),
+        objective=Objective(circularity_scale=20.0),
+        time_unit="year",
+        mass_unit="Mt",
+    )
+
+
+def kept_by(network: Network, actions: float) -> float:
+    """Return what constant recycling, without exports, books in its worst year."""
+    solved = bound(network, agents=AGENTS, min_service=0.9)
+    constant = np.broadcast_to([actions, -1.0], solved.actions.shape)
+    run = simulate_plan(replace(solved, actions=constant))
+    assert run.episode_levels.min() > 0.99
+    return float(run.bookings[0, 0].reshape(3, -1).sum(axis=1).max())
+
+
+@pytest.mark.slow
+def test_plans_and_mpc_keep_yearly_budgets_that_a_constant_plan_keeps() -> None:
+    """Plans that do not know where supplies begin exceed them by 6 %."""
+    network = harbour()
+    most = kept_by(network, 0.25)
+    solved = bound(network, agents=AGENTS, min_service=0.9, at_most={"emissions/year": most})
+    run = simulate_plan(improve_plan(solved))
+    assert solved.aims.totals(run).max() <= most * (1 + 1e-3)
+    assert run.episode_levels.min() >= 0.9 - 2e-3
+    control = MPC(min_service=0.9, at_most={"emissions/year": most})
+    run = rollout(MultiAgentVectorEnv(network, num_envs=1, agents=AGENTS), control)
+    assert solved.aims.totals(run).max() <= most * (1 + 2e-3)
+    assert run.episode_levels.min() >= 0.9 - 2e-3
+
+
+def around(actions: float) -> tuple[Bound, Dynamics]:
+    """Return a plan of constant actions, and the dynamics of its network."""
+    network = harbour(horizon=8)
+    nodes = [replace(node, initial=(112.0, 112.0)) if node.id == "use" else node for node in network.nodes]
+    network = replace(network, nodes=tuple(nodes))
+    solved = bound(network, agents=AGENTS, min_service=0.9, at_most={"emissions": 1e3})
+    return replace(solved, actions=np.full_like(solved.actions, actions)), Dynamics(network)
+
+
+def test_slopes_hold_supplies_and_tell_what_these_bring() -> None:
+    """What follows from an action at held supplies and what supplies add are, together, what the simulator does."""
+    plan, dynamics = around(-0.7)
+    slopes = jacobians(plan, dynamics)
+    supplies, run, entries = slopes.supplies, simulate_plan(plan), plan.actions.shape[1]
+    assert (supplies.amount > 0).any() and (supplies.amount == 0).any()
+    step = 1e-4
+    for t in range(len(plan.actions)):
+        moved = plan.actions.copy()
+        moved[t, 0] += step
+        trial = simulate_plan(replace(plan, actions=moved))
+        rows = [dynamics.network.arc_index[arc] for arc in ("imports", "mine_a", "mine_b")]
+        more = (trial.flow[t] - run.flow[t])[rows].sum()
+        stocks = dynamics.rows.nodes.stop
+        change = slopes.by_action[t, stocks:] @ np.append(np.array([step, 0.0]), more)
+        np.testing.assert_allclose(change, trial.flow[t] - run.flow[t], rtol=1e-3, atol=1e-9)
+    assert slopes.by_action.shape[2] == entries + 1
+    np.testing.assert_allclose(np.where(supplies.amount > 0, supplies.beyond, 0.0), 0.0)
+
+
+def test_supplies_of_a_step_begin_where_the_service_gets_short() -> None:
+    """Rows, ranges, and what is held; supplies at their most that are short do not fall."""
+    plan, dynamics = around(-0.7)
+    supplies = jacobians(plan, dynamics).supplies
+    table = np.array([[2.0, 3.0]])
+    for t in range(len(plan.actions)):
+        block, room = supplies.rows_of(t, table)
+        np.testing.assert_allclose(block.toarray(), -table)
+        np.testing.assert_allclose(room, supplies.beyond[t])
+        held, is_active = supplies.held(), supplies.amount[t, 0] > 0
+        block, room = held.rows_of(t, table)
+        if is_active:
+            np.testing.assert_allclose(block.toarray(), np.concatenate([-table, table]))
+            np.testing.assert_allclose(room, 0.0)
+        else:
+            assert held.high[t, 0] == 0.0 and len(room) == 0
+        np.testing.assert_allclose(supplies.low[t], -supplies.amount[t], atol=1e-9)
+    short = replace(dynamics.network.services[0], low=500.0)
+    network = replace(dynamics.network, services=(short,))
+    supplies = jacobians(replace(plan, network=network), Dynamics(network)).supplies
+    assert (supplies.low == 0).all() and (supplies.high == 0).all() and (supplies.beyond < 0).all()
