@@ -82,8 +82,8 @@ def optional_module(name: str, need: str, extra: str) -> Any:
     """Return a module that an extra of this package installs; a ``CirlError`` says what needs it, and how to get it."""
     try:
         return import_module(name)
-    except ImportError as missing:
-        raise CirlError(f"{need}: pip install 'cirl-marl[{extra}]'") from missing
+    except ImportError as failure:
+        raise CirlError(f"{need}: pip install 'cirl-marl[{extra}]'") from failure
 
 
 def unknown_name(kind: str, name: object, known_names: Iterable[object]) -> str:

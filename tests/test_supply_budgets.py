@@ -136,13 +136,13 @@ def test_supplies_of_a_step_begin_where_the_service_gets_short() -> None:
         block, room = supplies.rows_of(t, table)
         np.testing.assert_allclose(block.toarray(), -table)
         np.testing.assert_allclose(room, supplies.beyond[t])
-        held, is_active = supplies.held(), supplies.amount[t, 0] > 0
-        block, room = held.rows_of(t, table)
+        needed, is_active = supplies.at_need(), supplies.amount[t, 0] > 0
+        block, room = needed.rows_of(t, table)
         if is_active:
             np.testing.assert_allclose(block.toarray(), np.concatenate([-table, table]))
             np.testing.assert_allclose(room, 0.0)
         else:
-            assert held.high[t, 0] == 0.0 and len(room) == 0
+            assert needed.high[t, 0] == 0.0 and len(room) == 0
         np.testing.assert_allclose(supplies.low[t], -supplies.amount[t], atol=1e-9)
     short = replace(dynamics.network.services[0], low=500.0)
     network = replace(dynamics.network, services=(short,))

@@ -82,9 +82,9 @@ def alone(agent: str, copies: int, seed: int, steps: int, keeps: Keeps) -> BaseA
     """Return what plain ``learn()`` makes of one of them, with nobody around."""
     name, algorithm, parameters = KINDS[agent]
     env = DummyVecEnv([partial(short, name)] * copies)
-    model: BaseAlgorithm = algorithm("MlpPolicy", env, seed=derived_seed(seed, agent), device="cpu", **parameters)
-    env._seeds = [derived_seed(seed, "copies", i) for i in range(copies)]
     with one_torch_thread():
+        model: BaseAlgorithm = algorithm("MlpPolicy", env, seed=derived_seed(seed, agent), device="cpu", **parameters)
+        env._seeds = [derived_seed(seed, "copies", i) for i in range(copies)]
         return model.learn(steps, callback=keeps)
 
 
@@ -117,9 +117,9 @@ def test_copies_are_those_of_a_vector_environment() -> None:
     )
     team.learn(210)
     env = DummyVecEnv([partial(short, "Pendulum-v1")] * 3)
-    model = A2C("MlpPolicy", env, seed=derived_seed(2, "climber"), device="cpu", n_steps=7)
-    env._seeds = [derived_seed(2, "copies", i) for i in range(3)]
     with one_torch_thread():
+        model = A2C("MlpPolicy", env, seed=derived_seed(2, "climber"), device="cpu", n_steps=7)
+        env._seeds = [derived_seed(2, "copies", i) for i in range(3)]
         model.learn(210)
     assert same(team["climber"], model)
     assert type(team["climber"].rollout_buffer).__module__.startswith("stable_baselines3")  # type: ignore[attr-defined]

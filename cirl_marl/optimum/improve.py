@@ -189,7 +189,7 @@ def climb(
             )
             steps.append(_corrected_step(program, best, run, trials, price, value))
         progress(min((done + 1) / rounds, 1.0))
-        step = max(filter(None, steps), key=lambda each: each.gain, default=_Step(best, run, 0.0))
+        step = max(filter(None, steps), key=lambda step: step.gain, default=_Step(best, run, 0.0))
         if step.gain > 0:
             best, run = step.plan, step.run
             lack = np.maximum(demand - run.episode_levels[0], 0.0)  # a step lacks about what the last one did
@@ -227,11 +227,11 @@ def _corrected_step(
             break
         if corrected is program and program.promise(values) <= NO_PROMISE * abs(value):
             return None
-        moved = _with_actions(plan, np.clip(plan.actions + values[program.action], -1.0, 1.0))
-        trial = trials.simulate(moved)
+        candidate = _with_actions(plan, np.clip(plan.actions + values[program.action], -1.0, 1.0))
+        trial = trials.simulate(candidate)
         gain = trials.value(trial, price) - value
         if gain > best.gain:
-            best = _Step(moved, trial, gain)
+            best = _Step(candidate, trial, gain)
         elif best.gain > 0:
             break
         if best.gain > 0 and _shortage(trials.demand, plan.aims, trial) <= TOLERATED_SHORTFALL:

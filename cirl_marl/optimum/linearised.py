@@ -101,9 +101,9 @@ def jacobians(plan: ActionPlan, dynamics: Dynamics, first: int = 0) -> Slopes:
     flat = np.ascontiguousarray(columns.transpose(1, 0, 2).reshape(nodes + entries, -1))
     interval = np.repeat(interval, count + 1)
     controls = Actuators(network, plan.agents or None, flat.shape[1]).controls(flat[nodes:], interval)
-    held = np.repeat(supplies.controls[:, :, None], count + 1, axis=2)
-    held[:, :, nodes + entries : count] += (supplies.unit * inward.T[:, None]).transpose(1, 2, 0)
-    controls[supplies.rows] = held.reshape(len(held), flat.shape[1])
+    columns = np.repeat(supplies.controls[:, :, None], count + 1, axis=2)
+    columns[:, :, nodes + entries : count] += (supplies.unit * inward.T[:, None]).transpose(1, 2, 0)
+    controls[supplies.rows] = columns.reshape(len(columns), flat.shape[1])
     stocks, inner = dynamics.extend(flat[:nodes]), np.empty((0, flat.shape[1]))
     _, done = supply.advance(stocks, inner, controls, interval, idle & (not is_held))
     flows = np.concatenate([done.moved_mass, done.moved_substances]) / network.episode.control_interval
@@ -200,7 +200,7 @@ def step_program(
     network, limits = plan.network, plan.aims.limits if limits is None else limits
     steps, entries = plan.actions.shape
     state, services, is_absolute = slopes.end, len(network.services), network.objective.net_zero == "abs"
-    supplies = slopes.supplies.held() if is_held else slopes.supplies
+    supplies = slopes.supplies.at_need() if is_held else slopes.supplies
     acts = entries + len(supplies.services)
     period = slice(first, first + steps)
     intervals = range(period.start, period.stop)

@@ -324,8 +324,8 @@ class _QuasiSteady:
         self.rows.put(row[:, into], layout.end_flow[piece] + inflows, -factor)
         lengths = np.zeros(self.stores)
         lengths[into] = factor
-        missing = lengths[fast, None] * self.arrivals[fast]
-        self._allow(row[:, fast], fast, self.after[np.searchsorted(self.fast, fast)], missing)
+        shortfall = lengths[fast, None] * self.arrivals[fast]
+        self._allow(row[:, fast], fast, self.after[np.searchsorted(self.fast, fast)], shortfall)
 
     def _allow(self, row: Integers, nodes: Integers, transients: Floats, responses: Floats) -> None:
         """Allow for the transients of nodes, and for what they respond to schedules that may be cut."""
@@ -354,9 +354,9 @@ def cut_responses(ranges: IntervalRanges, linear: Linear, fast: Integers) -> tup
     stores, interval = len(network.stores), network.episode.control_interval
     gains = linear.gains.toarray()[:, fast]
     motion = gains[fast] - np.diag(ranges.exits[0, fast])
-    held = np.maximum(bernstein_means(motion, 0, interval)[0][0] * interval, 0.0) * WIDER + ROUND_OFF
+    contents = np.maximum(bernstein_means(motion, 0, interval)[0][0] * interval, 0.0) * WIDER + ROUND_OFF
     arrivals = linear.routes.most(into)
-    stocks = held @ arrivals[fast]
+    stocks = contents @ arrivals[fast]
     responses = np.zeros_like(into)
     responses[fast] = stocks
     responses[stores:] = linear.routes.through(into[stores:]) + linear.pass_flow.toarray()[:, fast] @ stocks

@@ -9,7 +9,7 @@ supplies and two rows,
 
 So it knows where supplies begin and end. That U is no more than needed it does not ask for, as that is no linear row.
 Where more is worth something, such as what reaches others beside, steps are worth trying in which supplies that bring
-something keep to δq = 0, and others to δU = 0 (``held``): true to first order wherever neither begins.
+something keep to δq = 0, and others to δU = 0 (``at_need``): true to first order wherever neither begins.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class IdleSupplies:
     rows: Annotated[Integers, "of the arcs among the controls, shape (arcs,)"]
     controls: Annotated[Floats, "of these in each interval, shape (arcs, steps)"]
     unit: Annotated[Floats, "what of these a unit of each U is, shape (supplies, arcs, steps)"]
-    is_held: Annotated[bool, "whether they bring just what is needed, see ``held``"] = False
+    is_held: Annotated[bool, "whether they bring just what is needed, see ``at_need``"] = False
 
     @classmethod
     def of(
@@ -62,14 +62,14 @@ class IdleSupplies:
         interval, idle = np.arange(first, first + steps), np.repeat(is_idle, steps, axis=1)
         places = np.unique(supply.of[arcs])
         controls, done = supply.advance(stock, np.empty((0, steps)), controls, interval, idle)
-        held, range_ = controls[supply.rows], SupplyRange(supply, interval, idle, None)
-        above = np.where(idle, held - range_.low, 0.0)
+        flow, range_ = controls[supply.rows], SupplyRange(supply, interval, idle, None)
+        above = np.where(idle, flow - range_.low, 0.0)
         weights = np.broadcast_to(supply.weights, above.shape)
         unit = range_.unit(np.divide(above, weights, out=np.zeros_like(above), where=weights > 0))
         units = np.where(supply.of[:, None] == places[:, None, None], unit, 0.0)
         fall, rise = (
             np.divide(room, units, out=np.full_like(units, np.inf), where=units > 0).min(axis=1, initial=np.inf)
-            for room in (above, range_.high - held)
+            for room in (above, range_.high - flow)
         )
         demand, most = supply.demand[places][:, interval], range_.most[places]
         beyond = supply.quantities(done.stock, done.moved_mass)[places] - demand
@@ -84,7 +84,7 @@ class IdleSupplies:
             low.T,
             np.where(np.isfinite(rise), rise, 0.0).T,
             supply.rows[arcs],
-            held[arcs],
+            flow[arcs],
             units[:, arcs],
         )
 
@@ -93,7 +93,7 @@ class IdleSupplies:
         """The largest range of each U, shape (supplies,)."""
         return np.asarray((self.high - self.low).max(axis=0, initial=0.0))
 
-    def held(self) -> IdleSupplies:
+    def at_need(self) -> IdleSupplies:
         """Return them without what may begin or end, but where that is about to happen."""
         return replace(self, high=np.where((self.amount == 0) & (self.beyond > 0), 0.0, self.high), is_held=True)
 
