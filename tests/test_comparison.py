@@ -222,6 +222,10 @@ def test_bad_input(bottles: Network, runs: list[Path]) -> None:
     """Each mistake has its own message."""
     with pytest.raises(CirlError, match="give a training run or a network"):
         compare()
+    with pytest.raises(CirlError, match=r"runs: 'copper_net' is a text; a list is needed, as \['copper_net'\]"):
+        compare("copper_net")
+    with pytest.raises(CirlError, match="controllers: 'neutral' is a text"):
+        compare([], "neutral", network=bottles)
     with pytest.raises(CirlError, match="Did you mean 'mpc'"):
         compare([], ["mcp"], network=bottles)
     with pytest.raises(CirlError, match="must be distinct"):

@@ -238,6 +238,9 @@ def compare(
         CirlError: for input that cannot be used, a controller that does not fit the network, or a solver that fails.
         RunError: if a run is incomplete, or of another environment.
     """
+    for name, sequence in (("runs", runs), ("controllers", controllers)):
+        if isinstance(sequence, str):
+            raise CirlError(f"{name}: '{sequence}' is a text; a list is needed, as ['{sequence}']")
     if episodes is not None:
         whole_number("episodes", episodes, 2)  # of fewer there is no confidence interval
     if network is None and scenario is not None:
