@@ -16,6 +16,8 @@ MEMORY, SQUARES = 0.9, 0.9
 """Weights of the past in the moments of Adam (Kingma and Ba 2015)."""
 PRICE_RATE, PRICE_DAMPING = 10.0, 5.0
 """Dual ascent: the price of a service moves by RATE·(lack + DAMPING·change of the lack), per circularity scale."""
+ROUND_OFF = 1e-9
+"""Mean level that a schedule may lack and still keep its demand: plans end a hair below."""
 
 
 @positional_record
@@ -67,7 +69,7 @@ def improve_schedule(
         levels, circularity = slope.levels.mean(axis=1), float(slope.circularity.mean())
         lacks = np.zeros_like(prices) if min_service is None else min_service - levels
         worth = circularity if min_service is not None else circularity / scale + float(prices @ levels)
-        rank = (-max(0.0, lacks.max(initial=0.0)), worth)
+        rank = (-max(0.0, lacks.max(initial=0.0) - ROUND_OFF), worth)
         if rank > best_rank:
             best, best_rank = ScheduleAscent(schedule, circularity, levels), rank
         by_action = slope.actions.mean(axis=2)
