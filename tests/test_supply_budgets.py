@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +26,8 @@ from cirl_marl import (
 )
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.dynamics.integrator import Dynamics
-from cirl_marl.optimum import Bound, bound, improve_plan, simulate_plan
+from cirl_marl.network import Floats
+from cirl_marl.optimum import Bound, bound, improve, improve_plan, simulate_plan
 from cirl_marl.optimum.linearised import jacobians
 
 AGENTS = ("recycle", "exports")
@@ -148,3 +151,41 @@ def test_supplies_of_a_step_begin_where_the_service_gets_short() -> None:
     network = replace(dynamics.network, services=(short,))
     supplies = jacobians(replace(plan, network=network), Dynamics(network)).supplies
     assert (supplies.low == 0).all() and (supplies.high == 0).all() and (supplies.beyond < 0).all()
+
+
+def test_the_plan_that_is_least_short_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a later one is worth more at its price, and exceeds the budget by more; prices rise, for more rounds."""
+
+    @dataclass
+    class Planned:
+        actions: Floats
+        network: Network
+        aims: Any
+
+    steps = iter([np.array([0.1]), None, np.array([0.2]), None])
+    excess = {0.0: 0.5, 0.1: 0.1, 0.3: 0.3}  # of the budget, by action; the last one is worth 2 more
+
+    def episode(plan: Planned) -> SimpleNamespace:
+        action = round(float(plan.actions[0, 0]), 6)
+        over, worth = np.array([excess[action]]), 20 * (action > 0.1)
+        return SimpleNamespace(episode_levels=np.zeros((1, 0)), excess=over, worth=worth)
+
+    step = SimpleNamespace(problem=None, scale=None, action=np.array([[0]]), promise=lambda values: 1.0)
+    step.with_correction = lambda *about: step
+    slopes = SimpleNamespace(supplies=SimpleNamespace(services=()))
+    monkeypatch.setattr(improve, "jacobians", lambda *about: slopes)
+    solved = list[object]()
+
+    def program(*about: object, **options: object) -> SimpleNamespace:
+        solved.append(about)
+        return step
+
+    monkeypatch.setattr(improve, "step_program", program)
+    monkeypatch.setattr(improve, "best_values", lambda *about: next(steps, None))
+    aims = SimpleNamespace(budgets=("budget",), limits=np.ones(1), sizes=np.ones(1), excess=lambda run: run.excess)
+    trials = improve.Trials(episode, lambda run, price: run.worth - float(price @ run.excess), np.zeros(0))
+    plan: Any = Planned(np.zeros((1, 1)), harbour(), aims)
+    best, price = improve.climb(plan, trials, np.ones(1), rounds=4)
+    assert best.actions == pytest.approx(0.1)
+    assert len(solved) == 4 * improve.EXTENSION
+    assert price[0] > 1
