@@ -25,6 +25,9 @@ def test_schedules_climb_towards_the_bound() -> None:
     assert bound.value >= best.circularity >= bound.value - 0.1 * (bound.value - first)
     played = cirl_marl.gradient(env, best.actions)
     assert played.circularity[0] == pytest.approx(best.circularity, rel=1e-12)
+    # a hair of lack is none: what has more service and is worse does not take its place
+    again = cirl_marl.improve_schedule(env, best.actions, min_service=best.levels + 5e-10, updates=30)
+    assert again.circularity >= best.circularity
 
 
 def test_the_best_of_common_draws_is_kept() -> None:
