@@ -456,8 +456,14 @@ class Service(CheckedRecord):
         Declaration("further compartments of which the same quantity is measured and added; no measures"),
     ] = ()
     low: Annotated[
-        Value, Quantity("lower end of the band: mass, mass/time or the measure's", of=BAND_OF, joint=True, varies=True)
-    ]
+        Value,
+        Quantity(
+            "lower end of the band: mass, mass/time or the measure's; 0 if left out",
+            of=BAND_OF,
+            joint=True,
+            varies=True,
+        ),
+    ] = 0.0
     high: Annotated[Value, Quantity("upper end, likewise; none if left out", of=BAND_OF, joint=True, varies=True)] = (
         math.inf
     )
