@@ -55,6 +55,12 @@ def test_a_region_is_a_network(tmp_path: Path) -> None:
         assert load_network(tmp_path / "written.toml") == network
 
 
+def test_the_only_region_need_not_be_named(tmp_path: Path) -> None:
+    """A table of one region becomes a definition that has one, which is the network."""
+    path = written(tmp_path, TEXT.replace(REGIONS, '[regions]\njapan = "Japan"\n'))
+    assert load_network(path) == load_network(f"{path}:japan")
+
+
 def test_only_the_region_asked_for_is_built(tmp_path: Path) -> None:
     """Spain has no rows, which nobody notices who does not ask for it."""
     path = written(tmp_path, TEXT)

@@ -74,6 +74,8 @@ class Definition:
             DefinitionError: with every mistake in what the scenario is made of; nothing is returned half-read. If
                 there is no such region, with those there are.
         """
+        if not region and len(self.regions) == 1:
+            (region,) = self.regions
         if region not in (self.regions or [""]):
             example = f"as in {self.path.name}:{next(iter(self.regions), 'japan')}"
             fault = f"which region? Known: {', '.join(self.regions)}. Write it after a colon, {example}"
