@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import replace
+from inspect import isfunction, signature
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,16 +14,21 @@ from networkx import NetworkXError
 from numpy.typing import NDArray
 from small_networks import constant
 
+import cirl_marl
 from cirl_marl import (
     Arc,
     CirlError,
     ControlError,
     MultiAgentVectorEnv,
     Network,
+    Neutral,
     Node,
     load_network,
     parallel_env,
+    resume,
+    rollout,
     single_agent_env,
+    train,
     vector_env,
 )
 
@@ -274,6 +281,36 @@ def test_misspelt_options_name_the_nearest() -> None:
         load_network("copper_net").with_options(episod={"horizon": 3})
     with pytest.raises(CirlError, match="fixed order"):
         parallel_env("copper_net", agents={"mine", "use"})
+
+
+def test_rollouts_of_something_else() -> None:
+    """A PettingZoo view in the place of the environment, a name or a class in that of the controller."""
+    with pytest.raises(ControlError, match=r"takes what vector_env\(.*returns, not NetworkParallelEnv"):
+        rollout(parallel_env("copper_net"), Neutral())
+    for controller in ("neutral", Neutral):
+        with pytest.raises(ControlError, match=r"takes a controller, such as Neutral\(\).* not .*[nN]eutral"):
+            rollout(vector_env("copper_net", num_envs=1), controller)  # type: ignore[arg-type]
+
+
+def test_devices_that_are_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Are refused before a run is begun: one that torch does not know, and one that this machine lacks."""
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    for device, hint in (("cpuu", r"Did you mean 'cpu'\? "), ("cuda:77", "")):
+        with pytest.raises(CirlError, match=rf"unknown device of this machine '{device}'\. {hint}Known: cpu"):
+            train("copper_net", steps=100, device=device, directory=tmp_path / "run")
+        with pytest.raises(CirlError, match="unknown device"):
+            resume(tmp_path / "run", device=device)
+    assert not any(tmp_path.iterdir())
+
+
+def test_every_path_may_be_a_text() -> None:
+    """Of every public function: who has a ``Path`` of it is no exception."""
+    for name in cirl_marl.__all__:
+        member = getattr(cirl_marl, name)
+        if isfunction(member):
+            annotations = signature(member).parameters.values()
+            pathlike = [str(one.annotation) for one in annotations if "Path" in str(one.annotation)]
+            assert all("str | Path" in annotation for annotation in pathlike), name
 
 
 class Unconvertible:

@@ -12,7 +12,7 @@ from cirl_marl.controllers.basic import Arrays, Controller, Planner
 from cirl_marl.dynamics.laws import LAWS
 from cirl_marl.environments.present import PresentEnv
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import whole_number
+from cirl_marl.errors import ControlError, whole_number
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 
@@ -118,7 +118,14 @@ def rollout(
     >>> _ = rollout(MultiAgentVectorEnv("net_zero", num_envs=1, horizon=2), Neutral(), progress=shares.append)
     >>> shares
     [0.5, 1.0]
+
+    Raises:
+        ControlError: if ``env`` or ``controller`` is something else, such as a PettingZoo view or a name.
     """
+    if not isinstance(env, MultiAgentVectorEnv):
+        raise ControlError(f"rollout takes what vector_env(network, num_envs=…) returns, not {type(env).__name__}")
+    if not isinstance(controller, Controller):
+        raise ControlError(f"rollout takes a controller, such as Neutral() or Trained(run), not {controller!r}")
     observations = env.reset(seed=seed, options={"initial_state": start or {}})
     steps, rows, batches, physics = env.network.episode.horizon, env.rows, env.dynamics.batches, env.dynamics.inner
     before = env.physical

@@ -68,7 +68,7 @@ def pareto_front(
     network: str | Path | Network,
     recipe: str | Path | Recipe | None = None,
     *,
-    directory: Path,
+    directory: str | Path,
     scenario: str | None = None,
     points: int = 5,
     seeds: int = 1,
@@ -103,6 +103,7 @@ def pareto_front(
         NoCertificate: if there is no bound and nothing to train either.
         RunError: if ``directory`` holds the runs of something else, or a training fails elsewhere.
     """
+    directory = Path(directory)
     check_place(on, workers)
     whole_number("points", points, 2)
     whole_number("seeds", seeds, 1)

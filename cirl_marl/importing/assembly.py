@@ -56,9 +56,9 @@ class ImportReport:
 
 
 def import_flows(
-    flows: Path,
-    out: Path,
-    stocks: Path | None = None,
+    flows: str | Path,
+    out: str | Path,
+    stocks: str | Path | None = None,
     *,
     roles: Mapping[str, Sequence[str]],
     stores: Sequence[str] = (),
@@ -93,6 +93,7 @@ def import_flows(
     Raises:
         CirlError: naming file, line and value, or what does not balance, with what to do; nothing is written.
     """
+    flows, out, stocks = Path(flows), Path(out), None if stocks is None else Path(stocks)
     if out.suffix != ".toml":
         raise CirlError(f"--out {out}: needs the name of a .toml file")
     if out.exists():

@@ -28,6 +28,7 @@ from cirl_marl.learners.lockstep import global_streams_claimed
 from cirl_marl.learners.policies import Policies
 from cirl_marl.learners.recipe import ENGINES, OPTIONS, Recipe, load_recipe
 from cirl_marl.learners.run_directory import RunConfig, RunDirectory
+from cirl_marl.learners.stacked.conditions import check_device
 from cirl_marl.learners.trainer import Progress, Training, run_together
 from cirl_marl.network import Network
 from cirl_marl.records.files import publish_folder
@@ -125,6 +126,7 @@ def _train(
     device: str,
     **options: Any,
 ) -> list[Training]:
+    check_device(device)
     with ExitStack() as claims:
         claims.enter_context(global_streams_claimed())
         trainings = [prepare(network, recipe, seed=seed, **options) for seed, _ in runs]
@@ -232,6 +234,7 @@ def resume(
         RunError: if nothing is left to do, if a complete run no longer has the replay buffers that it needs, if it is
             being trained, or if its directory is not whole.
     """
+    check_device(device)
     run = RunDirectory(directory)
     config = run.config
     with global_streams_claimed(), run.lock():

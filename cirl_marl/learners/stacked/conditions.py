@@ -16,6 +16,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor
 
+from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.learners.learner import Learner
 from cirl_marl.learners.policies import CentralCriticPolicy
 from cirl_marl.learners.recipe import LearnerSettings, Run
@@ -30,6 +31,20 @@ OPTIMISERS = (torch.optim.Adam, torch.optim.AdamW, torch.optim.RMSprop, torch.op
 SQUASHED = (TD3, DDPG, SAC, TQC)
 """Off-policy algorithms whose actors are perceptrons with bounded outputs."""
 EXTRACTORS = {ActorCriticPolicy: FlattenExtractor, CentralCriticPolicy: CombinedExtractor}
+
+
+def check_device(device: str) -> None:
+    """Refuse a device on which torch cannot compute here.
+
+    Raises:
+        CirlError: naming it, and those of this machine.
+    """
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:  # the latter where torch is built without CUDA
+        accelerators = {"cuda": torch.cuda, "mps": torch.backends.mps}
+        present = [name for name, module in accelerators.items() if module.is_available()]
+        raise CirlError(unknown_name("device of this machine", device, ["cpu", *present])) from error
 
 
 def gradient_stacks(trainings: Iterable[Iterable[Learner]], device: str, run: Run) -> list[Stack]:
