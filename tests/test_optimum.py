@@ -551,10 +551,11 @@ def test_plan_refuses_what_it_was_not_made_for() -> None:
         ("carbo_net", "temperature", "inner physics"),
         ("net_zero", None, "inner physics"),
         ("solids_net", None, "move batches"),
+        ("copper_net", "outages", r"nobody foresees what disturbs it \(.+\); bound\(…, uncertain=True\)"),
     ],
 )
 def test_networks_without_certificate(name: str, scenario: str | None, said: str) -> None:
-    """Inner physics, batches and inexact solvers have no certificate, and the error says which it is."""
+    """Inner physics, batches, inexact solvers and disturbances have no certificate, and the error says which it is."""
     with pytest.raises(NoCertificate, match=said):
         bound(name, scenario=scenario)
 

@@ -358,7 +358,7 @@ def _exclusions(network: Network) -> Iterator[str]:
         yield f"{batches} move batches"
     if network.disturbed:
         names = ", ".join(network.processes.names)
-        yield f"nobody foresees what disturbs it ({names}); a program is of a draw, or of what is expected"
+        yield f"nobody foresees what disturbs it ({names}); bound(…, uncertain=True) is of what to expect"
 
 
 def normalised_actions(
