@@ -654,7 +654,9 @@ def test_rounding_is_no_deviation() -> None:
 
 def test_a_single_decision_has_a_bound() -> None:
     """Nothing is new after it, so that it is perfect information's."""
-    found = bound(works(3), horizon=1, min_service=0.5, degree=1, uncertain=Sampling(draws=40, fit_draws=8))
+    sampling, shares = Sampling(draws=40, fit_draws=8), list[float]()
+    found = bound(works(3), horizon=1, min_service=0.5, degree=1, uncertain=sampling, progress=shares.append)
+    assert min(np.diff(shares)) > -1e-9 and len(set(shares)) > 8 and shares[-1] == pytest.approx(1.0)
     assert found.value == pytest.approx(found.perfect_information, abs=1e-9)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -86,7 +87,9 @@ def compare(
         directories, known = [RunDirectory(run) for run in runs or ()], [n for n in names if n != "price_policy"]
         contenders(directories, known, definition, min_service, uncertain, futures=futures)
         sampling = Sampling(draws=bound_draws, seed=seed, numbers=bool(uncertain), on=on, workers=workers)
-        expected = bound(definition, min_service=min_service, degree=1, uncertain=sampling)
+        with common.shares() as progress:
+            proved = partial(progress, "bound")
+            expected = bound(definition, min_service=min_service, degree=1, uncertain=sampling, progress=proved)
     with common.shares() as progress:
         place: dict[str, Any] = {"network": network, "scenario": scenario, "progress": progress}
         comparison = compared(runs or [], names, uncertain_bound=expected, **place, **options)

@@ -205,6 +205,7 @@ def bound(
     horizon: int | None = None,
     degree: int = DEGREE,
     uncertain: Literal[True] | Sampling,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> UncertainBound: ...
 
 
@@ -222,6 +223,7 @@ def bound(
     degree: int = DEGREE,
     near: Bound | None = None,
     uncertain: bool | Sampling = False,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> Bound | UncertainBound:
     """Bound what any admissible actions can reach over one episode in the simulator.
 
@@ -252,6 +254,7 @@ def bound(
         near: a bound of a similar program, from whose solution this one is reached sooner: another start or level.
         uncertain: whether disturbances and uncertain numbers are drawn, and how if not by default; excludes
             ``service_weight``, ``near`` and ``aim``.
+        progress: with ``uncertain``, which takes minutes, called with the share that is done.
 
     Raises:
         NoCertificate: for a network whose flows are not linear laws: inner physics, batches, inexact solvers.
@@ -268,8 +271,8 @@ def bound(
             options = "service_weight, near and aim"
             raise CirlError(f"uncertain: {options} go with a certain future; demand min_service")
         levels = None if min_service is None else demanded_levels(definition, min_service)
-        sampling = uncertain if isinstance(uncertain, Sampling) else Sampling()
-        return uncertain_bound(definition, agents, initial, levels, degree, sampling, aims_of(definition, aim, at_most))
+        sampling, aims = uncertain if isinstance(uncertain, Sampling) else Sampling(), aims_of(definition, aim, at_most)
+        return uncertain_bound(definition, agents, initial, levels, degree, sampling, aims, progress)
     aims = aims_of(definition, aim, at_most, with_services=True)
     if service_weight is not None and not aims.is_circular:
         raise CirlError(f"service_weight goes with the aim '{CIRCULARITY}', not with {aim!r}; demand min_service")

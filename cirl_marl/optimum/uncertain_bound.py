@@ -218,9 +218,10 @@ def uncertain_bound(
     for future in futures:
         programs.append(DrawProgram(future, agents, degree, aims=aims))
         check_size(programs[-1])
+        progress(0.1 * len(programs) / len(futures))
     demand = np.zeros(0) if min_service is None else min_service
     scale = network.objective.circularity_scale
-    clairvoyant, prices = fit_prices(programs, demand, scale, progress=lambda share: progress(0.3 * share))
+    clairvoyant, prices = fit_prices(programs, demand, scale, progress=lambda share: progress(0.1 + 0.2 * share))
     proofs = prove_draws(
         network, actors, start, degree, sampling, (clairvoyant, prices), aims, lambda share: progress(0.3 + 0.7 * share)
     )
