@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -381,6 +382,44 @@ def test_supplies_cost_few_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(terms) == 3 * 20
 
 
+@pytest.mark.parametrize(
+    ("make", "most"),
+    [
+        (lambda: workshops(17, 4, is_fast=True), 12),  # what other numbers of terms change teaches nothing
+        (lambda: workshops(1, 4, is_fast=True), 40),  # by secants
+        (lambda: reserve(12.0, 50.0), 6),  # of which nothing is left, so that no correction changes anything
+    ],
+)
+def test_corrections_learn_from_those_before_them(
+    make: Callable[[], Network], most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So few intervals are simulated in full in an episode."""
+    env, counts = MultiAgentVectorEnv(make(), num_envs=4), list[int]()
+    advance = env.dynamics.advance
+
+    def advance_counted(*args: Any) -> Any:
+        counts.append(1)
+        return advance(*args)
+
+    env.idle = np.ones_like(env.idle)
+    env.reset(seed=1)
+    monkeypatch.setattr(env.dynamics, "advance", advance_counted)
+    for _ in range(env.network.episode.horizon):
+        env.advance(np.zeros((len(env.agents), 4)))
+    assert len(counts) <= most
+
+
+def test_a_copy_that_an_estimate_satisfies_is_as_a_lone_one() -> None:
+    """It waits for others of the batch, and what its last correction was to bring tells how the next one will do."""
+    batch, lone = (MultiAgentVectorEnv(workshops(147, 1), num_envs=count) for count in (6, 1))
+    for env, seeds in ((batch, [*range(6)]), (lone, [5])):
+        env.idle = np.ones_like(env.idle)
+        env.reset(seed=seeds)
+    for _ in range(2):
+        flow = batch.advance(np.zeros((len(batch.agents), 6))).flow[:, 5:]
+        np.testing.assert_array_equal(flow, lone.advance(np.zeros((len(lone.agents), 1))).flow)
+
+
 @given(seed=st.integers(0, 2**31), lifetimes=st.booleans(), substances=st.booleans())
 @settings(max_examples=25)
 def test_estimates_of_stocks_are_what_all_terms_come_to(seed: int, lifetimes: bool, substances: bool) -> None:
@@ -472,6 +511,16 @@ def twins(demand: tuple[float, float], most: tuple[float, float], rate: float) -
         for i, low in enumerate(demand)
     )
     return Network(name="twins", nodes=(*nodes, *ends), arcs=tuple(arcs), services=services, episode=Episode(horizon=2))
+
+
+def test_a_source_that_two_services_empty_is_no_cause_to_warn() -> None:
+    """Corrections run out with room left where none of it would arrive; a warning would be an error here."""
+    network = twins((51.0, 73.0), (50.0, 1e4), 0.1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
+    env.idle = np.ones_like(env.idle)
+    env.reset(seed=0, options={"initial_state": {"use_0": 28.0, "use_1": 24.0, "ore": 61.0}})
+    env.advance(np.zeros((len(env.agents), 1)))
+    assert env.rows.stocks(env.physical.stock)[network.node_index["ore"]] < 1e-9
 
 
 def test_what_nothing_is_demanded_of_is_not_supplied_in_vain(monkeypatch: pytest.MonkeyPatch) -> None:

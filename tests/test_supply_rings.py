@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -159,6 +160,18 @@ def test_pivots_leave_what_is_supplied_where_it_does_not_arrive() -> None:
     lack = shortage - slope @ (supply - now)
     assert supply[1] == 4.0
     assert (lack[[0, 2]] <= 1e-12).all() and (lack[[0, 2]][supply[[0, 2]] > 0] >= -1e-12).all()
+
+
+def test_sources_that_ran_out_are_no_cause_to_warn() -> None:
+    """Though there is room for more, none of it would arrive; a warning would be an error here."""
+    network = rings(118)
+    nodes = tuple(replace(node, initial=(6.0, 30.0)) if node.id == "ore" else node for node in network.nodes)
+    env = MultiAgentVectorEnv(replace(network, nodes=nodes), num_envs=4)
+    env.idle = np.ones_like(env.idle)
+    env.reset(seed=118)
+    for _ in range(4):
+        env.advance(np.zeros((len(env.agents), 4)))
+    assert env.rows.stocks(env.physical.stock)[env.network.node_index["ore"]].min() < 1e-9
 
 
 def test_where_corrections_run_out_a_warning_says_so_once(monkeypatch: pytest.MonkeyPatch) -> None:

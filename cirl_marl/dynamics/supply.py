@@ -239,11 +239,10 @@ class Supply:
                     break
         assert done is not None
         if (gap > NOTABLE * demand).any():
-            # where there is room, more would arrive, and no source has run out
-            room = np.where(shortage > 0, range_.most - supply, supply) > NOTABLE * range_.most
+            # more would arrive, and no source has run out
             arrives = np.diagonal(slope, axis1=1, axis2=2).T > TINY * min(1.0, self._interval)
             is_cut = done.moved_mass[self.indices] < (1.0 - NOTABLE) * self._interval * all_controls[self.rows]
-            could_move = room & arrives & (self.total(np.where(is_cut & idle, 1.0, 0.0)) == 0)
+            could_move = arrives & (self.total(np.where(is_cut & idle, 1.0, 0.0)) == 0)
             self._warn(np.where(could_move, gap, 0.0), demand, step)
         return all_controls, done
 
