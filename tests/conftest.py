@@ -268,8 +268,8 @@ def with_substances(network: Network, seed: int, *, batches: bool = False) -> Ne
         for low, high in [ends[int(rng.integers(2))]]
     ]
     substances = tuple(Substance(id=name, scale=0.1) for name in names)
-    network = replace(
-        network, nodes=tuple(nodes), arcs=tuple(arcs), services=tuple(services), substances=substances, scenarios={}
+    network = network.variant(  # some limits are out of reach
+        nodes=tuple(nodes), arcs=tuple(arcs), services=tuple(services), substances=substances
     )
     return with_changing_contents(network, seed) if not batches and rng.random() < 0.5 else network
 

@@ -519,12 +519,12 @@ def test_mistakes_are_named(mistake, message: str) -> None:  # type: ignore[no-u
 def test_files_say_how_contents_change(tmp_path: Path) -> None:
     """By series, distributions and disturbances, of which a scenario states others."""
     path = tmp_path / "mine.toml"
-    richer = '\n[scenarios.rich.nodes.ore]\ncontent.copper = { value = 30, unit = "%", source = "s" }\n'
+    richer = '\n[scenarios.rich.nodes.ore]\ncontent.copper = { value = 25, unit = "%", source = "s" }\n'
     path.write_text(definition_of(unforeseen()) + richer)
     network = load_network(path)
     assert (network.nodes, network.uncertain) == (unforeseen().nodes, unforeseen().uncertain)
     assert network.disturbed == unforeseen().disturbed
-    assert dict(network.scenario("rich").nodes[0].content)["copper"] == 0.3
+    assert dict(network.scenario("rich").nodes[0].content)["copper"] == 0.25
 
 
 def test_draws_of_histories_are_summed_at_the_same_time() -> None:

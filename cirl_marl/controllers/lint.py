@@ -19,7 +19,6 @@ from cirl_marl.network.compartment_model import ReleasingModel
 from cirl_marl.network.elements import Arc, ControlKind, Law, Role
 from cirl_marl.network.lifetimes import CLOSE
 from cirl_marl.network.series import Series, extremes
-from cirl_marl.network.substances import separated_substances
 from cirl_marl.network.units import factor
 from cirl_marl.network.validation.settings import is_whole
 
@@ -43,7 +42,7 @@ def lint_warnings(network: Network, env: MultiAgentVectorEnv | None = None) -> I
     ``env`` is one copy of it; None makes one.
     """
     env = MultiAgentVectorEnv(network, num_envs=1) if env is None else env
-    for look in (_apart, _without_effect, _shares, _departures, _free, _markets, _impure):
+    for look in (_apart, _without_effect, _shares, _departures, _free, _markets):
         yield from look(network)
     neutral = cache(partial(episode_start(env).play, env, Neutral()))
     yield from _short_flows(env, neutral)
@@ -52,22 +51,6 @@ def lint_warnings(network: Network, env: MultiAgentVectorEnv | None = None) -> I
         yield from look(network)
     yield from _coarse(env)
     yield from _lives(network)
-
-
-def _impure(network: Network) -> Iterator[str]:
-    """Yield services of contents that no mixture of what there is can keep, of substances that no node separates."""
-    holders = [node for node, most in zip(network.stores, network.initial[1], strict=True) if most > 0]
-    for service in network.services:
-        substance = service.substance
-        if not substance or substance in separated_substances(network):
-            continue
-        parts = [extremes(dict(node.content).get(substance, 0.0)) for node in holders]
-        least, most = min((low for low, _ in parts), default=0.0), max((high for _, high in parts), default=1.0)
-        subject = f"service '{service.id}': nothing separates '{substance}', and no stock has"
-        if extremes(service.high)[1] < least:
-            yield f"{subject} less than {least:.3g} of it, more than its limit {extremes(service.high)[1]:.3g}"
-        if extremes(service.low)[0] > most:
-            yield f"{subject} more than {most:.3g} of it, less than the {extremes(service.low)[0]:.3g} that it asks for"
 
 
 def _apart(network: Network) -> Iterator[str]:

@@ -34,6 +34,7 @@ from cirl_marl.network.split_fractions import Split, is_order, splits
 from cirl_marl.network.substances import CONTENT, changes, changing_sources, contents
 from cirl_marl.network.uncertainty import CAPACITY, CERTAIN, factor_ranges
 from cirl_marl.network.validation import problems
+from cirl_marl.network.validation.content_limits import limit_problems
 
 if TYPE_CHECKING:
     import networkx
@@ -49,7 +50,7 @@ class Network(Specification):
     def __post_init__(self) -> None:
         """Put nodes with a stock first; refuse a network that cannot be simulated, naming every fault."""
         object.__setattr__(self, "nodes", tuple(sorted(self.nodes, key=lambda node: not node.stores)))
-        faults = list(problems(self))
+        faults = list(problems(self)) or list(() if self.is_variant else limit_problems(self))
         if faults:
             raise NetworkError(f"network '{self.name}'", faults)
 
@@ -84,7 +85,11 @@ class Network(Specification):
             for name in [item for item in values if item not in options]:
                 raise CirlError(f"with_options: {group}: {unknown_name('field', name, options)}")
         changes = {group: replace(getattr(self, group), **dict(values)) for group, values in groups.items()}
-        return replace(self, **changes, scenarios={})
+        return self.variant(**changes)
+
+    def variant(self, **changes: Any) -> Network:
+        """Return a copy with other fields and no other scenarios, in which limits of contents may be out of reach."""
+        return replace(self, **changes, scenarios={}, is_variant=True)
 
     def in_local_order(self) -> Network:
         """Return the same network with neighbours next to each other: nodes by reverse Cuthill-McKee, arcs by donor.

@@ -47,6 +47,8 @@ class Specification:
         copies: ids of the nodes of each copy in it, by region, if it has copies of another definition.
         scenario_name: the scenario that this network describes.
         scenarios: the other scenarios of the same definition, by name.
+        is_variant: whether it is what another network is under other options, or in a draw; limits of contents that the
+            other could keep are no mistakes of such a one.
     """
 
     name: str
@@ -75,6 +77,7 @@ class Specification:
     copies: Mapping[str, tuple[str, ...]] = field(default_factory=dict, repr=False, compare=False)
     scenario_name: str = "default"
     scenarios: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)
+    is_variant: bool = field(default=False, repr=False, compare=False)
 
     @property
     def address(self) -> str:

@@ -121,6 +121,26 @@ def proportions(shares: Floats, remainder: Floats) -> Floats:
     return np.asarray(weights / weights.sum(axis=0))
 
 
+def share_ranges(split: Split, wishes: Floats) -> Floats:
+    """Return the lowest and highest share of each arc, first of those with a control, shape (2, arcs, steps).
+
+    A share rises with what its own arc asks for and falls with what the others do.
+
+    Args:
+        split: the arcs.
+        wishes: least and most that each control asks for, shape (2, controlled, steps).
+    """
+    low = split.bounds[0]
+    room = np.maximum(1.0 - low.sum(axis=0), 0.0)
+    over = np.maximum(wishes - low, 0.0)
+    # against the least of one arc stands the most of all others, and the other way round
+    rivals = (over.sum(axis=1, keepdims=True) - over)[::-1]
+    total = over + rivals
+    cut = np.divide(room, total, out=np.ones_like(total), where=total > room)
+    rest = room - np.minimum(over.sum(axis=1), room)[::-1]
+    return np.concatenate([low + over * cut, rest[:, None] * split.proportions], axis=1)
+
+
 def is_order(arc: Arc, stockless: Collection[str]) -> bool:
     """Return whether an arc orders from one of the nodes that store nothing: a flow, whatever enters them."""
     return arc.donor in stockless and arc.law in (Law.CONTROLLED, Law.EXOGENOUS)

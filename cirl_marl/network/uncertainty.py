@@ -331,7 +331,7 @@ def draw_network(network: Any, factors: Sequence[float] = (), path: Floats | Non
 
     groups = {key: tuple(map(with_draws, getattr(network, key))) for key in KINDS}
     certain: dict[str, Any] = {"uncertain": {}, "disturbances": {}, "disturbed": {}, "correlation": None}
-    return replace(network, **groups, **certain, scenarios={})
+    return network.variant(**groups, **certain)
 
 
 def _drawn_shares(network: Any, drawn_arc: Callable[[int], Any]) -> Iterator[tuple[int, str, Any]]:
@@ -383,7 +383,7 @@ def network_of_intervals(network: Any, intervals: Integers) -> Any:
         return replace(part, **series)
 
     groups = {key: tuple(map(part_of_intervals, getattr(network, key))) for key in KINDS}
-    return replace(network, **groups, episode=replace(network.episode, horizon=len(intervals)), scenarios={})
+    return network.variant(**groups, episode=replace(network.episode, horizon=len(intervals)))
 
 
 def _course(name: str, values: Floats, interval: float) -> Value:

@@ -18,7 +18,7 @@ from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import positional_record, with_field_docs
 from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Node
-from cirl_marl.network.split_fractions import Split
+from cirl_marl.network.split_fractions import Split, share_ranges
 from cirl_marl.optimum.content_ranges import Mixtures, content_ranges, source_grades
 from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.vintages import Lifetimes
@@ -273,26 +273,6 @@ class IntervalRanges:
         single = self.rate * ((self.driver == network.donors) & ~self.share_arcs)
         outflow = [np.bincount(network.donors, bound, len(network.nodes)) for bound in single]
         self.exits = np.array(outflow, dtype=float) + self.release
-
-
-def share_ranges(split: Split, wishes: Floats) -> Floats:
-    """Return the lowest and highest share of each arc, first of those with a control, shape (2, arcs, steps).
-
-    A share rises with what its own arc asks for and falls with what the others do.
-
-    Args:
-        split: the arcs.
-        wishes: least and most that each control asks for, shape (2, controlled, steps).
-    """
-    low = split.bounds[0]
-    room = np.maximum(1.0 - low.sum(axis=0), 0.0)
-    over = np.maximum(wishes - low, 0.0)
-    # against the least of one arc stands the most of all others, and the other way round
-    rivals = (over.sum(axis=1, keepdims=True) - over)[::-1]
-    total = over + rivals
-    cut = np.divide(room, total, out=np.ones_like(total), where=total > room)
-    rest = room - np.minimum(over.sum(axis=1), room)[::-1]
-    return np.concatenate([low + over * cut, rest[:, None] * split.proportions], axis=1)
 
 
 def _mixtures(

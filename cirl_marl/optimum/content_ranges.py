@@ -15,13 +15,12 @@ from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Arc
 from cirl_marl.network.initial_ages import content_edges
+from cirl_marl.network.reachable_contents import reachable_contents
 from cirl_marl.network.series import means
-from cirl_marl.network.substances import changing_sources, contents, separates
+from cirl_marl.network.substances import changing_sources, contents
 
 ROUND_OFF = 1e-9
 """Part of all stocks that one of them may have too much or too little of a component, as simulators round."""
-SETTLED, ROUNDS = 1e-12, 1000
-"""Change of a range in a round that counts as none, and rounds after which what still changes may be anything."""
 
 
 @positional_record
@@ -54,9 +53,7 @@ class Mixtures:
 def content_ranges(network: Network, shares: Floats, present: Floats | None = None) -> tuple[Floats, Floats]:
     """Return what part of each flow, and of each stock, each component may be at any time, whatever agents do.
 
-    Stocks begin with their content and mix what enters; what a node hands on in shares that differ by component has
-    s_c·x_c of Σ s·x. The ranges are the least that contain the start, or all that a history or a changing source had,
-    and reproduce themselves. Nothing is said of the stocks of changing sources.
+    They begin with all that a start, a history or a changing source has; see ``reachable_contents``.
 
     Args:
         network: whose nodes have the contents.
@@ -69,33 +66,14 @@ def content_ranges(network: Network, shares: Floats, present: Floats | None = No
         Least and greatest part, shapes (2, components, arcs) and (2, components, stores); from 1 to 0 of flows that
         there never are.
     """
-    is_separate = np.zeros(len(network.arcs), dtype=bool)
-    for split in network.splits:
-        is_separate[[*split.controlled_arcs, *split.other_arcs]] = separates(network, split)
-    ranges = np.tile([[[1.0]], [[0.0]]], (1, 1 + len(network.substances), len(network.nodes)))
+    starts = np.empty((2, 1 + len(network.substances), len(network.stores)))
     for i, node in enumerate(network.stores):
         parts = contents(network, node, partial(means, edges=content_edges(network, node)))
-        ranges[:, :, i] = parts.min(axis=1), parts.max(axis=1)
+        starts[:, :, i] = parts.min(axis=1), parts.max(axis=1)
     if present is not None:
-        stores = ranges[:, :, : present.shape[2]]
-        stores[...] = np.minimum(stores[0], present[0]), np.maximum(stores[1], present[1])
-    for done in range(ROUNDS + len(network.nodes)):
-        flows = _handed_on(ranges[:, :, network.donors], shares, is_separate)
-        wider = ranges.copy()
-        np.minimum.at(wider[0].T, network.recipients, flows[0].T)
-        np.maximum.at(wider[1].T, network.recipients, flows[1].T)
-        changed = np.abs(wider - ranges).max(axis=(0, 1)) > SETTLED
-        ranges = wider
-        if not changed.any():
-            break
-        if done >= ROUNDS:
-            ranges[0][:, changed], ranges[1][:, changed] = 0.0, 1.0
-    changes = ranges[0] != ranges[1]
-    margin = np.array([-1e-9, 1e-9])[:, None, None] * changes  # of rounding, and what was too little to have settled
-    ranges = (ranges + margin).clip(0.0, 1.0)
-    stocks = ranges[:, :, : len(network.stores)].copy()
-    stocks[..., [network.node_index[source.id] for source in changing_sources(network)]] = [[[0.0]], [[1.0]]]
-    return _handed_on(ranges[:, :, network.donors], shares, is_separate), stocks
+        starts = np.stack([np.minimum(starts[0], present[0]), np.maximum(starts[1], present[1])])
+    stocks, flows = reachable_contents(network, starts, shares)
+    return flows, stocks
 
 
 def present_contents(rows: StateLayout, stock: Floats) -> Floats:
@@ -143,15 +121,3 @@ def check_contents(network: Network, mixtures: Mixtures, rows: StateLayout, init
             if off[worst] > ROUND_OFF * initial.sum():
                 fault = f"by its content, and by what enters it, {low:.4g} to {high:.4g} may be"
                 raise CirlError(f"initial: {mass[worst] / whole[worst]:.4g} of '{node.id}' is {name}; {fault}")
-
-
-def _handed_on(content: Floats, shares: Floats, is_separate: NDArray[np.bool_]) -> Floats:
-    """Return the ranges of contents of flows, of those of their donors and the shares of each component."""
-    (low, high), (least, most) = content, shares
-    is_separate = is_separate & (low <= high).all(axis=0)
-    result = content.copy()
-    for side, part, own, others in ((0, low, least, most.max(axis=0)), (1, high, most, least.min(axis=0))):
-        gain, rest = own * part, (1.0 - part) * others
-        edge = np.divide(gain, gain + rest, out=np.full_like(gain, float(side)), where=gain + rest > 0)
-        result[side][:, is_separate] = edge[:, is_separate]
-    return result

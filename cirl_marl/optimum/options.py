@@ -133,7 +133,7 @@ def with_margin(network: Network, margin: float) -> Network:
         replace(s, low=_times(s.low, margin), high=_times(s.high, factor))
         for s, factor in zip(network.services, factors, strict=True)
     )
-    return replace(network, services=tuple(services))
+    return network.variant(services=tuple(services))
 
 
 def _times(value: Value, factor: float) -> Value:

@@ -98,7 +98,7 @@ def simulate_plan(bound: Bound) -> Rollout:
     """Return the episode that the plan of ``bound`` makes in the simulator."""
     network = bound.network
     stores = [replace(n, initial=(x, x)) for n, x in zip(network.stores, bound.stock[0].tolist(), strict=True)]
-    start_network = replace(network, nodes=(*stores, *network.nodes[len(stores) :]))
+    start_network = network.variant(nodes=(*stores, *network.nodes[len(stores) :]))
     env = MultiAgentVectorEnv(start_network, num_envs=1, agents=bound.agents or None)
     stages = [row for rows in env.rows.stages.values() for row in rows.tolist()]
     start = {env.rows.start_names[row]: float(bound.initial[row]) for row in stages}

@@ -165,4 +165,4 @@ def with_bound(network: Network, agent: str, side: int, values: Floats) -> Netwo
     variant = replace(compartment, control=control)
     nodes = tuple(variant if node.id == agent else node for node in network.nodes)
     arcs = tuple(variant if arc.id == agent else arc for arc in network.arcs)
-    return replace(network, nodes=nodes, arcs=arcs, scenarios={})  # type: ignore[arg-type]
+    return network.variant(nodes=nodes, arcs=arcs)

@@ -34,7 +34,7 @@ def variant_of(network: Network, variant: int) -> Network:
     nodes = tuple(with_factor(with_factor(node, "rate"), "initial") for node in network.nodes)
     arcs = tuple(with_factor(arc, "rate") for arc in network.arcs)
     services = tuple(with_factor(service, "low", "high") for service in network.services)
-    return replace(network, nodes=nodes, arcs=arcs, services=services, scenarios={})
+    return network.variant(nodes=nodes, arcs=arcs, services=services)
 
 
 def times(value: Any, factor: float) -> Any:

@@ -1,0 +1,222 @@
+"""Limits of contents that nothing can keep, and the ranges of contents by which they are told."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from test_changing_contents import NOISE, mine
+from test_substances import sorter, sorting_line, substances_networks
+
+from cirl_marl import (
+    Arc,
+    DefinitionError,
+    Law,
+    MultiAgentVectorEnv,
+    Network,
+    NetworkError,
+    Node,
+    Service,
+    Substance,
+    bound,
+    load_network,
+    simulate_plan,
+)
+from cirl_marl.definitions.writer import definition_of
+from cirl_marl.network.disturbances import DisturbanceEffect
+from cirl_marl.network.reachable_contents import reachable_contents
+from cirl_marl.network.series import Series
+from cirl_marl.network.uncertainty import Spread, factor_ranges, network_of_intervals
+from cirl_marl.network.validation import content_limits
+from cirl_marl.optimum.options import with_margin
+from cirl_marl.reasons.prices import with_bound
+
+SPREAD = Spread(low=0.5, high=1.2, distribution="uniform")
+
+
+def with_limit(network: Network, high: float | Series, **changes: Any) -> Network:
+    """Return a network that is checked, whose last service has this limit."""
+    *demands, last = network.services
+    return replace(
+        network, services=(*demands, replace(last, low=0.0, high=high)), is_variant=False, scenarios={}, **changes
+    )
+
+
+def uncertain_network(network: Network, seed: int) -> Network:
+    """Return a network of which contents, transfers and shares are drawn, as far as they can be."""
+    paths = [f"nodes.{node.id}.content.{name}" for node in network.nodes for name in dict(node.content)]
+    paths += [f"arcs.{arc.id}.transfer.{name}" for arc in network.arcs for name in dict(arc.transfer)]
+    paths += [f"arcs.{arc.id}.{name}" for arc in network.arcs for name in ("share", "control")]
+    for path in np.random.default_rng(seed).permutation(paths)[:5].tolist():
+        try:
+            network = network.variant(uncertain={**network.uncertain, path: SPREAD})
+        except NetworkError:
+            continue  # nothing is stated there, or some draws are no shares
+    return network
+
+
+@given(network=substances_networks, seed=st.integers(0, 1000), is_drawn=st.booleans())
+def test_no_episode_leaves_the_ranges(network: Network, seed: int, is_drawn: bool) -> None:
+    """Whatever random actions do and draws bring, contents of stocks and flows lie in what limits are held against."""
+    network = uncertain_network(network, seed) if is_drawn else network
+    starts = content_limits._starts(network, factor_ranges(network, with_draws=True))
+    ranges = reachable_contents(network, starts, content_limits._shares(network))
+    env = MultiAgentVectorEnv(network, num_envs=4, uncertain=bool(network.uncertain))
+    env.reset(seed=seed)
+    rng, count, stores = np.random.default_rng(seed), len(network.substances), len(network.stores)
+    for _ in range(network.episode.horizon):
+        env.advance(rng.choice([-1.0, 0.0, 1.0], (len(env.actuators.control_rows), 4)))
+        stock = env.physical.stock
+        held = env.rows.stocks(stock)[:stores], env.rows.substances(stock).reshape(count, -1, 4)[:, :stores]
+        moved = env.physical.flow, env.physical.substances.reshape(count, -1, 4)
+        for (whole, parts), (low, high) in zip((held, moved), ranges, strict=True):
+            margin = 1e-9 * whole + 1e-14 * stock.sum()
+            assert (parts >= low[1:, :, None] * whole - margin).all()
+            assert (parts <= high[1:, :, None] * whole + margin).all()
+
+
+@pytest.mark.parametrize(("controlled", "transfer"), [(False, 0.8), (True, 0.9)])
+def test_limits_that_no_sorting_keeps_are_refused(controlled: bool, transfer: float) -> None:
+    """Of 2 % copper at most that share is rejected: the rest has 0.45 or 0.23 %, the lowest limit, which is told."""
+    network = sorting_line(transfer=0.8, controlled=controlled)
+    passing = (1 - transfer) * 0.02
+    least = passing / (passing + 0.9 * 0.98)
+    with pytest.raises(
+        NetworkError, match=r"service 'purity': high 0.002: at least .* in 'recovery' is copper"
+    ) as error:
+        with_limit(network, 0.002)
+    offer = float(re.findall(r"the lowest limit that can be kept is (\S+)$", str(error.value))[0])
+    assert least <= offer < least * 1.001
+    assert with_limit(network, offer) and with_limit(network, least)
+    with pytest.raises(NetworkError, match="whatever is done"):
+        with_limit(network, least * (1 - 1e-8))
+
+
+def test_grades_that_nothing_has_are_refused() -> None:
+    """The richest stock has 4 %, which is told; a limit between the poorest and the richest can be kept."""
+    assert sorter(low=0.01, high=0.02) and sorter(low=0.04)
+    with pytest.raises(NetworkError, match=r"low 0.05: at most 0.04 .*; the highest grade that can be had is 0.04$"):
+        sorter(low=0.05)
+    with pytest.raises(NetworkError, match=r"low 0.05: at most 0.04"):
+        sorter(low=Series(times=(0.0, 2.0), values=(0.01, 0.05)))
+
+
+def test_what_there_is_dilutes_and_an_empty_stock_does_not() -> None:
+    """Ore of 3 % in place of pure ore leaves only what the first product has, if there is any."""
+    network = sorter(low=0.0, high=0.02)
+    ore, scrap, use, *rest = network.nodes
+    nodes = (replace(ore, content={"copper": 0.03}), scrap, use, *rest)
+    with pytest.raises(NetworkError, match=r"service 'clean': high 0.02: at least 0.03 of what is in 'made' is copper"):
+        with_limit(network, 0.02, nodes=nodes)
+    in_use = replace(network.services[1], provider="use", quantity="stock", high=0.01)
+    services = (network.services[0], in_use)
+    assert replace(network, nodes=nodes, services=services)
+    empty = (*nodes[:2], replace(use, initial=(0.0, 0.0), content={}), *rest)
+    with pytest.raises(NetworkError, match=r"high 0.01: at least 0.03 of what is in 'use' is copper"):
+        replace(network, nodes=empty, services=services)
+    bare = (*(replace(node, initial=(0.0, 0.0)) for node in nodes[:2]), *empty[2:])
+    assert replace(network, nodes=bare, services=services)  # nothing ever flows
+    sum_of_both = replace(in_use, also=("scrap",))
+    with pytest.raises(NetworkError, match="of what is in 'use, scrap' is copper"):
+        replace(network, nodes=empty, services=(sum_of_both,))
+
+
+def test_a_loop_that_separates_again_and_again_keeps_every_limit() -> None:
+    """What comes back is sorted anew; none of it comes back pure where nothing is separated."""
+    network = sorting_line(transfer=0.8)
+    again = Arc(id="again", donor="recovered", recipient="use", law=Law.DONOR, rate=1.0)
+    arcs = (network.arcs[0], replace(network.arcs[1], recipient="recovered"), network.arcs[2], again)
+    nodes = (*network.nodes, Node(id="recovered", initial=(0.0, 0.0)))
+    assert with_limit(network, 1e-6, nodes=nodes, arcs=arcs)
+    plain = tuple(replace(arc, transfer={}) for arc in arcs)
+    with pytest.raises(NetworkError, match=r"the lowest limit that can be kept is 0.02$"):
+        with_limit(network, 1e-6, nodes=nodes, arcs=plain)
+
+
+def test_limits_and_contents_that_change_are_those_of_some_time() -> None:
+    """A limit has to be within reach at each time, of the contents of all times."""
+    falling = Series(times=(0.0, 3.0), values=(0.2, 0.1))
+    lowest = 0.2 * 0.1 / (0.2 * 0.1 + 0.95 * 0.88 + 0.95 * 0.02)
+    network = mine(copper=falling)
+    assert with_limit(network, lowest * 1.0001)
+    strict = Series(times=(0.0, 2.0), values=(0.1, lowest * 0.99))
+    with pytest.raises(NetworkError, match=f"high {lowest * 0.99:g}: at least"):
+        with_limit(network, strict)
+
+
+@pytest.mark.parametrize("key", ["uncertain", "disturbed"])
+def test_draws_that_could_keep_a_limit_are_enough(key: str) -> None:
+    """Neither they nor others are refused then, nor what episodes draw."""
+    network, path = mine(copper=0.1), "nodes.ore.content.copper"
+    lowest = 0.02 / (0.02 + 0.95 * 0.88 + 0.95 * 0.02)
+    with pytest.raises(NetworkError, match="whatever is done"):
+        with_limit(network, 0.8 * lowest)
+    effect = {key: {path: SPREAD if key == "uncertain" else DisturbanceEffect(by="noise")}}
+    noise = {} if key == "uncertain" else {"disturbances": {"noise": NOISE}}
+    unsure = with_limit(network, 0.8 * lowest, **effect, **noise)
+    env = MultiAgentVectorEnv(unsure, num_envs=8, uncertain=key == "uncertain")
+    env.reset(seed=0)
+    assert [env.certain_network(copy).services for copy in range(8)] == [unsure.services] * 8
+    with pytest.raises(NetworkError, match="whatever is done"):
+        with_limit(network, 0.3 * lowest, **effect, **noise)
+
+
+def test_transfers_and_limits_that_are_drawn_may_be_any_and_the_most_generous() -> None:
+    """Nothing is refused of a split some share of which is drawn; of a limit its highest draw counts."""
+    network, path = sorting_line(transfer=0.5), "arcs.rejects.transfer.copper"
+    assert with_limit(network, 1e-5, uncertain={path: SPREAD})
+    rich = replace(network.services[0], provider="rejects", low=0.5, high=1.0)
+    assert replace(network, services=(rich,), uncertain={path: SPREAD}, is_variant=False)
+    with pytest.raises(NetworkError, match=r"at most 0.09259 of what is in 'rejects'"):  # 0.01 of 0.01 + 0.098
+        replace(network, services=(rich,), is_variant=False)
+    substances = (*network.substances, Substance(id="tin"))
+    nodes = (replace(network.nodes[0], content={"copper": 0.02, "tin": 0.98}), *network.nodes[1:])
+    arcs = (*network.arcs[:2], replace(network.arcs[2], transfer={"copper": 0.5, "tin": 0.05}))
+    with pytest.raises(NetworkError, match=r"at most 0.1695 of what is in 'rejects'"):  # 0.01 of 0.01 + 0.049
+        replace(network, nodes=nodes, arcs=arcs, substances=substances, services=(rich,), is_variant=False)
+    least = 0.01 / (0.01 + 0.9 * 0.98)
+    spread = {"services.purity.high": SPREAD}
+    assert with_limit(network, least / 1.19, uncertain=spread)
+    with pytest.raises(NetworkError, match="whatever is done"):
+        with_limit(network, least / 1.21, uncertain=spread)
+
+
+def test_files_name_limits_out_of_reach(tmp_path: Path) -> None:
+    """And the scenario in which they are."""
+    path = tmp_path / "sorter.toml"
+    poor = '\n[scenarios.poor.nodes.ore]\ncontent.copper = { value = 3, unit = "%", source = "s" }\n'
+    path.write_text(definition_of(sorter(low=0.0, high=0.02)) + poor)
+    with pytest.raises(DefinitionError) as error:
+        load_network(path, scenario="poor")
+    assert str(error.value).startswith(f"{path}: scenarios.poor.service 'clean': high 0.02: at least 0.03 of")
+
+
+def test_what_is_derived_is_not_checked_again() -> None:
+    """Other options, margins and starts of plans leave a limit where it is."""
+    network = sorting_line(transfer=0.8)
+    least = 0.004 / (0.004 + 0.9 * 0.98)
+    network = with_limit(network, least)
+    assert not network.is_variant and network.with_options(episode={"horizon": 2}).is_variant
+    assert with_margin(network, 1.1).services[-1].high == pytest.approx(least / 1.1)
+    run = simulate_plan(bound(with_margin(network, 1.1), degree=1))
+    assert run.episode_levels[0, 0] == pytest.approx(1 / 1.1, rel=1e-9)
+    assert with_bound(sorting_line(controlled=True), "rejects", 1, np.array([0.5])).is_variant
+    late = with_limit(mine(copper=Series(times=(0.0, 3.0), values=(0.2, 0.1))), 0.03)
+    assert network_of_intervals(late, np.array([0, 1])).services == late.services
+
+
+def test_a_plan_from_an_empty_stock_is_simulated() -> None:
+    """What would have diluted is not there, so that the limit is out of reach of that start alone."""
+    network = sorter(low=0.0, high=0.01)
+    ore, scrap, use, *rest = network.nodes
+    nodes = (replace(ore, content={"copper": 0.03}), scrap, replace(use, initial=(0.0, 10.0), content={}), *rest)
+    clean = Service(id="clean", provider="use", quantity="stock", substance="copper", low=0.0, high=0.01)
+    network = replace(network, nodes=nodes, services=(clean,))
+    run = simulate_plan(bound(network, initial={"ore": 500.0, "scrap": 100.0, "use": 0.0}, degree=1))
+    assert 0 < run.episode_levels[0, 0] <= 1
