@@ -422,12 +422,12 @@ def test_a_window_may_book_its_part_of_what_a_year_has_left() -> None:
     reference[:4, 0] = reference[4:, 1] = 0.2
     reference[:, 2] = 0.1
     limits, share = bookings.limits(0, range(0, 3), reference)
-    np.testing.assert_allclose(share, [3 / 4, 0.0, 0.0])
-    np.testing.assert_allclose(limits, [0.6 + 0.75 * 0.2, 0.0, np.inf])
+    np.testing.assert_allclose(share, [3 / 4, 0.0, 3 / 8])
+    np.testing.assert_allclose(limits, [0.6 + 0.75 * 0.2, 0.0, 0.3 + 3 / 8 * 0.2])
     env.step(control.act({}))
     bookings.follow([False])
     limits, share = bookings.limits(0, range(1, 4), reference)
-    np.testing.assert_allclose(share, [1.0, 0.0, 0.0])
+    np.testing.assert_allclose(share, [1.0, 0.0, 3 / 7])
     np.testing.assert_allclose(limits[0], 1.0 - env.physical.accounts[1, 0] / env.ledger.discount[1, 0] / 1e4)
     plan = control._plans[0].window
     assert plan is not None

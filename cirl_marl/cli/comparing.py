@@ -32,10 +32,11 @@ def compare(
     ] = None,
     seed: common.Seed = 0,
     min_service: common.MinService = None,
+    at_most: common.AtMost = None,
     uncertain: common.Uncertain = None,
     tune: Annotated[
         int | None,
-        typer.Option(help="Draws of their own on which margins are set to deliver --min-service on average."),
+        typer.Option(help="Draws on which margins are set to deliver --min-service and keep --at-most on average."),
     ] = None,
     futures: Annotated[int | None, typer.Option(min=1, help="Futures that scenario_mpc plans for; default: 4.")] = None,
     bounds: Annotated[bool, typer.Option(help="Whether each episode is held against the best possible.")] = True,
@@ -71,6 +72,7 @@ def compare(
         check_tuning(tune, min_service)
     folder, page = None if out is None else common.folder_for(out, "--out"), common.page_for(html)
     options: dict[str, Any] = {"seed": seed, "min_service": min_service, "uncertain": uncertain}
+    options["at_most"] = budgets = common.numbers_by_name(at_most, "--at-most", "ACCOUNT=TOTAL with a number")
     options |= {"tune": tune, "futures": futures, "bounds": bounds and bound_draws is None}
     expected = None
     if bound_draws is None and (on, workers) != ("here", None):
@@ -85,11 +87,11 @@ def compare(
         definition = load_network(network, scenario=scenario)
         # what cannot be compared is refused before the bound is computed, on which price_policy waits
         directories, known = [RunDirectory(run) for run in runs or ()], [n for n in names if n != "price_policy"]
-        contenders(directories, known, definition, min_service, uncertain, futures=futures)
+        contenders(directories, known, definition, min_service, uncertain, futures=futures, at_most=budgets)
         sampling = Sampling(draws=bound_draws, seed=seed, numbers=bool(uncertain), on=on, workers=workers)
+        asked: dict[str, Any] = {"min_service": min_service, "at_most": budgets, "uncertain": sampling}
         with common.shares() as progress:
-            proved = partial(progress, "bound")
-            expected = bound(definition, min_service=min_service, degree=1, uncertain=sampling, progress=proved)
+            expected = bound(definition, degree=1, progress=partial(progress, "bound"), **asked)
     with common.shares() as progress:
         place: dict[str, Any] = {"network": network, "scenario": scenario, "progress": progress}
         comparison = compared(runs or [], names, uncertain_bound=expected, **place, **options)

@@ -1,8 +1,9 @@
-"""A margin on what a controller aims at, set on draws of its own so that services are what is demanded of them."""
+"""Margins on what a controller aims at, set on draws of its own: services as demanded, budgets kept, on average."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
@@ -14,13 +15,15 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, whole_number
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import KeptRecord, positional_record
+from cirl_marl.optimum.aims import NO_AIMS, Aims
 
 FIRST_DRAW = 2**30 + 2**20
 """First seed of the draws; no evaluation has it."""
 FEWEST = 10
 """Draws below which nothing is tuned."""
 CLOSE = 0.002
-"""How close the expected level of the service that lacks most has to come to what is demanded."""
+"""How close the expected level of the service that lacks most has to come to what is demanded, and the expected amount
+of a budget, in parts of it, if it exceeds it."""
 TRIES = 8
 FIRST_STEP, LIMITS = 0.1, (0.03, 30.0)
 """Least relative change of the first margins, and their ends."""
@@ -28,11 +31,24 @@ FIRST_STEP, LIMITS = 0.1, (0.03, 30.0)
 
 @positional_record
 class Calibration(KeptRecord):
-    """A margin and what it delivers."""
+    """Margins and what they deliver."""
 
     margin: Annotated[float, "by what is multiplied what the controller aims at"]
     excess: Annotated[float, "least of expected levels less what is demanded, over the draws"]
     draws: Annotated[int, "how many"]
+    budget_margin: Annotated[float, "by what multipliers of budgets of an episode are multiplied"] = 1.0
+    overrun: Annotated[float, "most by which such a budget is exceeded on average, in parts of it; 0 for none"] = 0.0
+
+    @property
+    def margins(self) -> dict[str, float]:
+        """Both as options of a controller, that on budgets where it is not 1."""
+        options = {"margin": self.margin}
+        return options if self.budget_margin == 1.0 else options | {"budget_margin": self.budget_margin}
+
+    @property
+    def miss(self) -> float:
+        """How far it is from what is demanded."""
+        return max(abs(self.excess), self.overrun)
 
 
 def check_tuning(draws: int, demand: ArrayLike | None) -> None:
@@ -57,42 +73,60 @@ def calibrate(
     demand: Floats,
     draws: int,
     progress: Callable[[float], None] = lambda share: None,
+    aims: Aims = NO_AIMS,
 ) -> Calibration:
-    """Return the margin at which the service that lacks most is closest to what is demanded of it on average.
+    """Return the margins at which services are closest to what is demanded on average, and budgets are kept.
 
-    Margins grow or fall until they bracket it, then by secants (regula falsi).
+    The margin on services grows or falls until it brackets the level of what lacks most, then by secants (regula
+    falsi). That on multipliers of budgets rises while an expected amount exceeds its budget.
 
     Args:
         env: makes so many copies.
-        controller: makes it with a ``margin``.
+        controller: makes it with a ``margin``, and where there are budgets of the episode with a ``budget_margin``.
         demand: expected level demanded of each service, shape (services,).
         draws: on which it is tuned.
         progress: called with the share that is done.
+        aims: have the budgets; those of years, which hold in each copy, are left out.
 
     Raises:
         CirlError: for too few draws, or nothing that is demanded.
     """
     check_tuning(draws, demand)
-    copies, excess = env(draws), dict[float, float]()
-    margin, step = 1.0, FIRST_STEP
+    copies, tries, excess = env(draws), list[Calibration](), dict[float, float]()
+    margins, step, budget_step = Calibration(1.0, 0.0, draws), FIRST_STEP, FIRST_STEP
     for done in range(TRIES):
-        levels = rollout(copies, controller(margin=margin), seed=FIRST_DRAW).episode_levels.mean(axis=0)
-        excess[margin] = float((levels - demand).min())
+        run = rollout(copies, controller(**margins.margins), seed=FIRST_DRAW)
+        over = (aims.bookings(run).mean(axis=0) - aims.limits) / aims.sizes
+        overrun, margin = float(over[~aims.by_year].max(initial=0.0)), margins.margin
+        excess[margin] = float((run.episode_levels.mean(axis=0) - demand).min())
+        tries.append(replace(margins, excess=excess[margin], overrun=overrun))
         progress((done + 1) / TRIES)
-        if abs(excess[margin]) <= CLOSE / 2:
+        if tries[-1].miss <= CLOSE / 2:
             break
-        low = max((m for m in excess if excess[m] < 0), default=None)
-        high = min((m for m in excess if excess[m] > 0), default=None)
-        if low is None or high is None:
-            change = max(step, 2 * abs(excess[margin]))
-            margin, step = margin * (1 + change) if high is None else margin / (1 + change), 3 * step
-            if not LIMITS[0] < margin < LIMITS[1]:
-                break
-        elif low >= high:  # more is aimed at and less comes about
+        if overrun > CLOSE / 2:  # levels of before were at other multipliers
+            dearer = margins.budget_margin * (1.0 + max(budget_step, 2.0 * overrun))
+            margins, budget_step = replace(margins, budget_margin=dearer), 3.0 * budget_step
+            excess, step = {margin: excess[margin]}, FIRST_STEP
+        if abs(excess[margin]) > CLOSE / 2:
+            margin, step = _next_margin(excess, margin, step)
+        if not LIMITS[0] < margin < LIMITS[1]:
             break
-        else:
-            share = excess[low] / (excess[low] - excess[high])
-            margin = low + (high - low) * float(np.clip(share, 0.15, 0.85))
-    best = min(excess, key=lambda m: abs(excess[m]))
+        margins = replace(margins, margin=margin)
     progress(1.0)
-    return Calibration(best, excess[best], draws)
+    return min(tries, key=lambda calibration: calibration.miss)
+
+
+def _next_margin(excess: Mapping[float, float], margin: float, step: float) -> tuple[float, float]:
+    """Return what to try after a ``margin``, and the least change of the next, given the excess of those tried.
+
+    It is not finite where more is aimed at and less comes about.
+    """
+    low = max((m for m in excess if excess[m] < 0), default=None)
+    high = min((m for m in excess if excess[m] > 0), default=None)
+    if low is None or high is None:
+        change = max(step, 2 * abs(excess[margin]))
+        return margin * (1 + change) if high is None else margin / (1 + change), 3 * step
+    if low >= high:
+        return np.inf, step
+    share = excess[low] / (excess[low] - excess[high])
+    return low + (high - low) * float(np.clip(share, 0.15, 0.85)), step

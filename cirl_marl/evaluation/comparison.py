@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -24,7 +24,9 @@ from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, SHARE, Aggregate, over
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
+from cirl_marl.network.elements import CIRCULARITY
 from cirl_marl.optimum import NoCertificate, gap
+from cirl_marl.optimum.aims import NO_AIMS, Aims, aims_of
 from cirl_marl.optimum.options import demanded_levels, levels_text
 from cirl_marl.optimum.uncertain_bound import UncertainBound
 
@@ -200,6 +202,7 @@ def compare(
     episodes: int | None = None,
     seed: int = 0,
     min_service: ArrayLike | None = None,
+    at_most: Mapping[str, float] | None = None,
     bounds: bool = True,
     uncertain: bool | None = None,
     uncertain_bound: UncertainBound | None = None,
@@ -222,6 +225,7 @@ def compare(
         seed: different seeds share no episode.
         min_service: mean level of every service, or of each, shape (services,), that ``registry.PLANNERS`` plan for;
             None: what ``uncertain_bound`` is for, or else as much as can be had.
+        at_most: budgets that those of ``registry.WITH_AIMS`` keep; see ``bound``.
         bounds: whether to hold the episodes against the best possible.
         uncertain: whether each episode draws the uncertain numbers of the network, the same for everyone; each is then
             held against the best possible with the numbers that it drew. None: as in the draws of
@@ -230,7 +234,8 @@ def compare(
             service, to which entries have a gap as well: its draws are the episodes, whose number and seed it sets.
             ``price_policy`` acts by its prices.
         tune: draws of its own on which each controller that has a margin on what it aims at sets that so that the
-            expected level of the service that lacks most is ``min_service``; None: the margin is 1.
+            expected level of the service that lacks most is ``min_service``, and another one so that no expected
+            amount exceeds its budget; None: the margins are 1.
         futures: that ``scenario_mpc`` plans for; None: ``registry.FUTURES``.
         progress: called with what is being done and the share of all that is done.
 
@@ -257,8 +262,9 @@ def compare(
         min_service = uncertain_bound.min_service if min_service is None else min_service
         uncertain = numbers if uncertain is None else uncertain
     candidates, env = contenders(
-        run_directories, controls, variant, min_service, uncertain, futures=futures, prices=prices
+        run_directories, controls, variant, min_service, uncertain, futures=futures, prices=prices, at_most=at_most
     )
+    aims = aims_of(env.network, CIRCULARITY, at_most)
     demand = None if min_service is None else demanded_levels(env.network, min_service)
     if tune is not None:
         check_tuning(tune, demand)
@@ -269,10 +275,10 @@ def compare(
     episodes = enough_episodes(env.network) if episodes is None else episodes
     calibrations: list[Calibration | None] = [None] * len(candidates)
     if tune is not None and demand is not None:
-        calibrations, progress = _tune(candidates, demand, tune, progress), _after(progress, TUNING_SHARE)
+        calibrations, progress = _tune(candidates, demand, aims, tune, progress), _after(progress, TUNING_SHARE)
     share = 1 / (len(candidates) + (len({who_acts.name for who_acts in candidates}) if bounds else 0))
     actors = [
-        (contender, contender.controller() if calibration is None else contender.controller(margin=calibration.margin))
+        (contender, contender.controller(**({} if calibration is None else calibration.margins)))
         for contender, calibration in zip(candidates, calibrations, strict=True)
     ]
     checkpoints = [actor.checkpoint.name if isinstance(actor, Trained) else "" for _, actor in actors]
@@ -304,15 +310,16 @@ def compare(
 
 
 def _tune(
-    candidates: Sequence[Contender], demand: Floats, draws: int, progress: ProgressReport
+    candidates: Sequence[Contender], demand: Floats, aims: Aims, draws: int, progress: ProgressReport
 ) -> list[Calibration | None]:
-    """Return the margin of each that has one, set on other draws."""
+    """Return the margins of each that has one, set on other draws."""
     calibrations: list[Calibration | None] = [None] * len(candidates)
     share = TUNING_SHARE / len(candidates)
     for place, contender in enumerate(candidates):
         if contender.is_tunable:
             report = part_of(progress, f"{contender.name}, margin", place * share, share)
-            calibrations[place] = calibrate(contender.env, contender.controller, demand, draws, report)
+            budgets = aims if contender.has_budgets else NO_AIMS
+            calibrations[place] = calibrate(contender.env, contender.controller, demand, draws, report, budgets)
     return calibrations
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -15,15 +15,15 @@ from cirl_marl.errors import CirlError, RunError
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Network
 from cirl_marl.optimum.draws import Prices
-from cirl_marl.optimum.registry import CONTROLLERS, PLANNERS, TUNABLE, controllers_by_margin
+from cirl_marl.optimum.registry import CONTROLLERS, PLANNERS, TUNABLE, WITH_AIMS, controllers_by_margin
 
 
 @dataclass(frozen=True, slots=True)
 class Contender:
     """A policy or controller that is yet to act in its row of a comparison; ``seed`` and ``run`` are of its training.
 
-    ``controller`` makes it, if it ``is_tunable`` with a margin, and ``env`` the environment in which it acts, with so
-    many copies.
+    ``controller`` makes it, if it ``is_tunable`` with a margin, if it ``has_budgets`` with one on these, and ``env``
+    the environment in which it acts, with so many copies.
     """
 
     name: str
@@ -32,6 +32,7 @@ class Contender:
     controller: Callable[..., Controller]
     env: Callable[[int], MultiAgentVectorEnv]
     is_tunable: bool = False
+    has_budgets: bool = False
 
 
 def contenders(
@@ -43,6 +44,7 @@ def contenders(
     *,
     futures: int | None = None,
     prices: Prices | None = None,
+    at_most: Mapping[str, float] | None = None,
 ) -> tuple[list[Contender], MultiAgentVectorEnv]:
     """Return everyone who is compared, and a copy of the environment that they share.
 
@@ -59,6 +61,8 @@ def contenders(
         raise CirlError(f"controllers {list(controllers)} must be distinct")
     if futures is not None and "scenario_mpc" not in controllers:
         raise CirlError(f"futures {futures}: only scenario_mpc plans for them, which is not among the controllers")
+    if at_most and not set(controllers) & set(WITH_AIMS):
+        raise CirlError(f"at_most: none of {list(controllers)} keeps budgets; add one of {', '.join(WITH_AIMS)}")
     envs = [run.make_env(1, uncertain=uncertain) for run in runs]
     draws = bool(uncertain) if not envs else envs[0].uncertain
     first = envs[0] if network is None else MultiAgentVectorEnv(network, num_envs=1, uncertain=draws)
@@ -75,7 +79,7 @@ def contenders(
         return MultiAgentVectorEnv(network, num_envs=copies, agents=first.agents, uncertain=draws)
 
     plain = [
-        _controller(name, common_env, min_service, futures if name == "scenario_mpc" else None, prices)
+        _controller(name, common_env, min_service, futures if name == "scenario_mpc" else None, prices, at_most)
         for name in controllers
     ]
     return [*_policies(runs, uncertain), *plain], first
@@ -164,8 +168,9 @@ def _controller(
     min_service: ArrayLike | None,
     futures: int | None,
     prices: Prices | None,
+    at_most: Mapping[str, float] | None,
 ) -> Contender:
-    service = min_service if name in PLANNERS else None
+    service, budgets = min_service if name in PLANNERS else None, at_most if name in WITH_AIMS else None
     # an unknown name fails here, before anything is computed
-    controller = controllers_by_margin(name, min_service=service, futures=futures, prices=prices)
-    return Contender(name, None, None, controller, env, name in TUNABLE)
+    controller = controllers_by_margin(name, min_service=service, futures=futures, prices=prices, at_most=budgets)
+    return Contender(name, None, None, controller, env, name in TUNABLE, bool(budgets))

@@ -16,6 +16,7 @@ from cirl_marl.dynamics.ledger import Ledger
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.calendar import years
+from cirl_marl.network.compartment_model import Bools
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import CIRCULARITY
 from cirl_marl.network.units import factor
@@ -160,9 +161,14 @@ class Aims:
         return by_flow, by_stock, by_part
 
     @property
+    def by_year(self) -> Bools:
+        """Whether each budget is of a year, shape (budgets,)."""
+        return np.array([budget.year is not None for budget in self.budgets], dtype=bool)
+
+    @property
     def has_years(self) -> bool:
         """Whether some budget is of a year."""
-        return any(budget.year is not None for budget in self.budgets)
+        return bool(self.by_year.any())
 
     @property
     def limits(self) -> Floats:

@@ -46,7 +46,8 @@ from cirl_marl.optimum.windows import EMPTY, Continuation, WindowPlan, WindowTas
 SERVICE_FIRST = 1000.0
 """Weight of the mean service level, against λ̄/circularity_scale, at which service comes first."""
 LEAST_PRICE = 0.1
-"""Least that is charged for a unit of service that lacks in a disturbed network, in λ̄/circularity_scale."""
+"""Least that is charged in a disturbed network for a unit of service that lacks, and for a budget of the episode that
+is exceeded by itself, in λ̄/circularity_scale."""
 WINDOW = 3
 """Decisions that a plan looks ahead where the network is disturbed, unless another number is asked for. What comes
 after them has its price, and nobody knows it: on paper_city and steel_japan longer windows did no better."""
@@ -54,6 +55,8 @@ FROM_START = "MPC: budgets per year need every interval of an episode, from its 
 LEAD = 0.05
 """Part by which less than the demanded level has to be enough for the rest of a disturbed episode with yearly budgets,
 before a service costs no more than in the plan of the expected episode."""
+SPREAD = 0.5
+"""ε: the part by which a budget of a disturbed episode is dearer beyond its plan, and cheaper below."""
 NOTABLE = 2e-3
 """Part of a budget, or level of a service, by which a plan misses it and says so."""
 FIRST_SAMPLE, SAMPLES = 2**30, 256
@@ -93,7 +96,7 @@ class _Bookings:
         """
         self._aims, self._env, self._counts = aims, env, aims.counts(env.ledger)
         self._accounts = [budget.account for budget in aims.budgets]
-        self._by_year = np.flatnonzero([budget.year is not None for budget in aims.budgets])
+        self._by_year = np.flatnonzero(aims.by_year)
         self._step, self._totals = env.physical.step.copy(), env.physical.accounts.copy()
         if len(self._by_year) and self._step.any():
             raise ControlError(FROM_START)
@@ -123,9 +126,7 @@ class _Bookings:
         return remainder
 
     def limits(self, copy: int, window: range, reference: Floats) -> tuple[Floats, Floats]:
-        """Return what a window may book of each budget, and which part of what is left of its year it has.
-
-        Of budgets of the episode, which hold in expectation, it may book anything.
+        """Return what a window may book of each budget, and which part of what is left of its time it has.
 
         Args:
             copy: whose.
@@ -136,9 +137,7 @@ class _Bookings:
         rest, within = counts[window.start :].sum(axis=0), counts[window.start : window.stop].sum(axis=0)
         share = within / np.maximum(rest, 1)
         left = self.remainders(copy) / self._aims.sizes - reference[window.start :].sum(axis=0)
-        is_yearly = np.isin(np.arange(len(left)), self._by_year)
-        limits = reference[window.start : window.stop].sum(axis=0) + share * left
-        return np.where(is_yearly, limits, np.inf), np.where(is_yearly, share, 0.0)
+        return reference[window.start : window.stop].sum(axis=0) + share * left, share
 
 
 class MPC(Planner):
@@ -154,10 +153,12 @@ class MPC(Planner):
     a budget is kept depends on all that is to come, so that plans look to the end of the episode.
 
     In a disturbed network ``min_service`` is of the *expected* levels: what lacks in any interval is charged for at the
-    multipliers of the plan for what is expected, or those of the ``prices``, whatever was delivered before, and so is
-    what is booked on budgets of the episode. Budgets per year hold in each copy as far as they can: with what is booked
-    already a window may book what is left of the year, less what is planned for after it, with an equal part of the
-    deviation for each interval to come. Beside them a service that is not ahead of its demand is dearer.
+    multipliers of the plan for what is expected, or those of the ``prices``, whatever was delivered before. Budgets per
+    year hold in each copy as far as they can: with what is booked already a window may book what is left of the year,
+    less what is planned for after it, with an equal part of the deviation for each interval to come. Beside them a
+    service that is not ahead of its demand is dearer. Budgets of the episode hold in expectation: what is booked costs
+    (1 − ε) of their multiplier, and what a window has beyond such a part (1 + ε). So a copy pays nearly the same
+    wherever it is, and returns to the plan where the multiplier leaves the choice open.
     """
 
     ahead = 0.1  # a first plan takes longer than the later ones, which start from it
@@ -174,6 +175,7 @@ class MPC(Planner):
         replan: int | None = None,
         futures: int | None = None,
         margin: float = 1.0,
+        budget_margin: float = 1.0,
         prices: Prices | None = None,
         delay: int = 0,
     ) -> None:
@@ -193,6 +195,7 @@ class MPC(Planner):
                 expected to be.
             margin: by what the demanded bands of services are multiplied in plans, or in a disturbed network what is
                 charged for service that lacks.
+            budget_margin: by what the multipliers of budgets of a disturbed episode are multiplied.
             prices: of a bound for who does not foresee (``bound(…, uncertain=True)``): a plan then looks a single
                 interval ahead, and what stocks are worth after it follows the states of the disturbances.
             delay: intervals by which disturbances are seen late; from the horizon on they are never seen.
@@ -202,6 +205,7 @@ class MPC(Planner):
         """
         check_options(service_weight, min_service, degree)
         check_margin(margin)
+        check_margin(budget_margin, "budget_margin")
         if prices is not None and (not is_of_circularity(aim) or at_most):
             raise CirlError("prices are those of λ̄ and service: leave out aim and at_most")
         if service_weight is not None and not is_of_circularity(aim):
@@ -219,7 +223,7 @@ class MPC(Planner):
             raise CirlError(f"horizon {horizon} is shorter than the {replan} decisions carried out of each plan")
         self._options = horizon, replan, futures
         self._prices, self._delay = prices, delay
-        self._margin, self._aim, self._at_most = margin, aim, at_most
+        self._margin, self._budget_margin, self._aim, self._at_most = margin, budget_margin, aim, at_most
         self._min_service, self._weight, self._degree = min_service, service_weight, degree
 
     def plan(self, env: MultiAgentVectorEnv, seed: int, progress: Callable[[float], None]) -> None:
@@ -330,10 +334,11 @@ class MPC(Planner):
         else:
             if deficit is not None and not self._climbs:  # no level is demanded, all that lacks has its price
                 deficit = np.full(len(deficit), float(len(rest)))
-            demands = _Demands(deficit, charges=outlook.charges, price=self._price)
-            if self._aims.has_years:
+            demands = _Demands(deficit, price=self._price)
+            if self._aims.budgets:
                 limits, share = self._bookings.limits(copy, window, outlook.bookings)
-                charges = np.where(share < 1, outlook.charges, 0.0)
+                part = np.where(self._aims.by_year, share < 1, self._budget_margin * (1.0 - SPREAD))
+                charges = part * outlook.charges
                 demands = _Demands(deficit, limits, charges, self._present_price(copy, outlook))
         if last is None:
             self._outlooks.pop(copy, None)
@@ -359,15 +364,17 @@ class MPC(Planner):
     def _present_price(self, copy: int, outlook: WindowPlan) -> Floats:
         """Return what a disturbed copy is charged for budgets that are exceeded and for services that lack.
 
-        Budgets come first. Beside them a service is dearer until what was delivered is ahead of what is demanded.
+        Budgets of years come first. Beside them a service is dearer until what was delivered is ahead of its demand.
         """
-        budgets, steps = len(self._aims.budgets), self._env.network.episode.horizon
-        if self._levels is None:
-            return np.append(RISE * outlook.task.price[:budgets], self._price)
-        state = self._env.physical
-        rest = (self._levels * steps - state.service[:, copy]) / (steps - state.step[copy])
-        service_price = self._price * np.where(rest >= (1.0 - LEAD) * self._levels, FIRST_PRICE, 1.0)
-        return np.append(RISE * outlook.task.price[:budgets], service_price)
+        aims, service_price = self._aims, self._price
+        least = LEAST_PRICE / FIRST_PRICE * self._planner.first_price[: len(aims.budgets)]
+        beyond = 2.0 * SPREAD * self._budget_margin * np.maximum(outlook.charges, least)
+        if self._levels is not None and aims.has_years:
+            state, steps = self._env.physical, self._env.network.episode.horizon
+            rest = (self._levels * steps - state.service[:, copy]) / (steps - state.step[copy])
+            service_price = service_price * np.where(rest >= (1.0 - LEAD) * self._levels, FIRST_PRICE, 1.0)
+        of_years = RISE * outlook.task.price[: len(aims.budgets)]
+        return np.append(np.where(aims.by_year, of_years, beyond), service_price)
 
     def _state_costs(self, costs: Floats, copy: int, window: range) -> Floats:
         """Return the costs of what comes after a window, with prices that follow the states of the disturbances.

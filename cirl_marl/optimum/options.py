@@ -114,14 +114,14 @@ def levels_text(network: Network, levels: Floats) -> str:
     return ", ".join(f"{level:g} of '{service.id}'" for level, service in zip(levels, network.services, strict=True))
 
 
-def check_margin(margin: float) -> None:
-    """Refuse a margin that is not positive and finite.
+def check_margin(margin: float, name: str = "margin") -> None:
+    """Refuse a margin, which an option ``name`` has, that is not positive and finite.
 
     Raises:
         CirlError: naming it.
     """
     if not 0 < margin < math.inf:
-        raise CirlError(f"margin {margin!r} must be positive and finite")
+        raise CirlError(f"{name} {margin!r} must be positive and finite")
 
 
 def with_margin(network: Network, margin: float) -> Network:

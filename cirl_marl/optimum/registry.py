@@ -42,6 +42,7 @@ def named_controller(
     min_service: ArrayLike | None = None,
     smooth: bool | None = False,
     margin: float = 1.0,
+    budget_margin: float = 1.0,
     futures: int | None = None,
     prices: Prices | None = None,
     aim: Aim = CIRCULARITY,
@@ -56,6 +57,7 @@ def named_controller(
             as can be had.
         smooth: whether the plans of ``optimum`` are to change little; see ``Optimum``.
         margin: by what those of TUNABLE multiply what they aim at, or divide what may lack.
+        budget_margin: by what ``mpc`` and ``scenario_mpc`` multiply what budgets of a disturbed episode cost.
         futures: that ``scenario_mpc`` plans for; None: FUTURES.
         prices: of a bound for who does not foresee, which ``price_policy`` needs.
         aim: of WITH_AIMS: what is aimed at beside a demanded service; see ``bound``.
@@ -74,6 +76,8 @@ def named_controller(
         raise CirlError(f"a margin goes with {', '.join(TUNABLE)} control, not with {name}")
     if futures is not None and name != "scenario_mpc":
         raise CirlError(f"futures go with scenario_mpc control, not with {name}")
+    if budget_margin != 1.0 and (not at_most or name not in TUNABLE):
+        raise CirlError(f"budget_margin {budget_margin:g} goes with at_most and mpc or scenario_mpc control")
     has_aim = not is_of_circularity(aim)
     if (has_aim or at_most) and name not in WITH_AIMS:
         raise CirlError(f"an aim and budgets of accounts go with {', '.join(WITH_AIMS)} control, not with {name}")
@@ -87,7 +91,9 @@ def named_controller(
         options: dict[str, Any] = {"min_service": min_service, "service_weight": weight, "smooth": smooth}
         return Optimum(aim=aim, at_most=at_most, **options)
     if name in PLANNERS:
-        return _planner(name, min_service, margin, futures, prices, {"aim": aim, "at_most": at_most})
+        return _planner(
+            name, min_service, margin, futures, prices, {"aim": aim, "at_most": at_most, "budget_margin": budget_margin}
+        )
     makers: Mapping[str, Callable[[], Controller]] = {
         "neutral": Neutral,
         "constant": lambda: Constant(constants),

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from cirl_marl.evaluation.calibration import CLOSE, Calibration
 from cirl_marl.evaluation.comparison import Comparison, Row
 from cirl_marl.evaluation.episode_count import EPISODES_DISTURBED, MOST_EPISODES
 from cirl_marl.evaluation.figures import provenance
@@ -88,12 +89,14 @@ def comparison_notes(comparison: Comparison) -> list[str]:
         notes.append(f"trained: {trained}; controllers: mean over episodes, Student's t")
     if any(row.has_few_seeds for row in comparison.rows):
         notes.append(f"few: fewer than {ENOUGH_SEEDS} training seeds; the interval says little, one seed has none")
-    calibrations = {row.name: row.entries[0].calibration for row in comparison.rows}
-    margins = [
-        f"{name} {calibration.margin:.4g}" for name, calibration in calibrations.items() if calibration is not None
-    ]
-    if margins:
+    by_name = {row.name: row.entries[0].calibration for row in comparison.rows}
+    calibrations = {name: calibration for name, calibration in by_name.items() if calibration is not None}
+    if calibrations:
+        margins = [f"{name} {_margins_text(calibration)}" for name, calibration in calibrations.items()]
         notes.append(f"margins, set on other draws: {', '.join(margins)}")
+    for name, calibration in calibrations.items():
+        if calibration.overrun > CLOSE:
+            notes.append(f"{name}: what it is expected to book exceeds a budget by {calibration.overrun:.1%} there")
     for name, excess in comparison.misses().items():
         notes.append(f"{name}: its expected service misses what is demanded by {excess:+.4f}")
     times = {row.name: _milliseconds(row) for row in comparison.rows}
@@ -198,6 +201,12 @@ def _headers(comparison: Comparison) -> list[str]:
         "foresight_gap": "gap to perfect information",
     }
     return [words[name] for name in comparison.figures]
+
+
+def _margins_text(calibration: Calibration) -> str:
+    """Return the margin, and that on budgets where they are dearer."""
+    budgets = calibration.budget_margin
+    return f"{calibration.margin:.4g}" + (f" (of budgets {budgets:.4g})" if budgets != 1.0 else "")
 
 
 def _milliseconds(row: Row) -> float:
