@@ -7,6 +7,7 @@ import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -34,7 +35,7 @@ from cirl_marl import (
 from cirl_marl.cli import app
 from cirl_marl.controllers import Constant
 from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
-from cirl_marl.evaluation.account_front import AccountFront, _Sweep, volume_dominated
+from cirl_marl.evaluation.account_front import AccountFront, _Sweep, _within_reach, volume_dominated
 from cirl_marl.network.elements import Role
 from cirl_marl.optimum import bound, improve_plan, simulate_plan, supply_limits
 from cirl_marl.optimum.bounds import tight_bound
@@ -165,8 +166,38 @@ def test_plans_that_do_more_than_is_demanded_dominate_no_more_than_is_proved() -
         least=-9.0,
     )
     assert front.volumes == pytest.approx((0.5 * 0.25, 0.25 * 0.25))
+    for lack, counts in ((0.9e-3, True), (1.1e-3, False)):  # a plan that is short of a demand counts up to a thousandth
+        volume = replace(front, shortages=np.array([lack, 0.0])).volumes[1]
+        assert volume == pytest.approx(0.25 * 0.25 if counts else 0.0)
     limited = replace(front, is_limited=np.array([False, True]), least=-1.1)
     np.testing.assert_allclose(limited.at([[0.5], [0.75], [1.0]]), [-1.0, -1.0, -1.1])
+
+
+@pytest.mark.parametrize(("excess", "demands"), [(2e-4, [100.0, 100.01, 100.02]), (0.5e-4, [100.005])])
+def test_demands_cover_the_range_of_an_account_if_there_is_one(
+    excess: float, demands: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the least that a plan books to what the best plan of the first does; a ten-thousandth is no range."""
+    network, least, free = city(), SimpleNamespace(accounts=np.full((1, 2), 100.0)), np.full(2, 100.0 * (1 + excess))
+    monkeypatch.setattr("cirl_marl.evaluation.account_front.bound", lambda *arguments, **options: None)
+    monkeypatch.setattr(_Sweep, "_best", lambda *arguments: (SimpleNamespace(accounts=free), False))
+    monkeypatch.setattr(_Sweep, "_carried_out", lambda *arguments: least)
+    sweep = _Sweep.__new__(_Sweep)
+    sweep.definition, sweep.axes, sweep.points = network, ("circularity", "cost"), 3
+    sweep._accounts, sweep._services = [account.id for account in network.accounts], [network.services[0].id]
+    sweep.demands, sweep.solutions, sweep.runs, sweep.are_limited = [], [], [], []
+    sweep._progress = lambda activity, share: None
+    sweep.run(sweep.axes, {}, np.zeros(1))
+    np.testing.assert_allclose(np.array(sweep.demands)[:, 0], demands, rtol=1e-12)
+
+
+def test_the_highest_service_is_had_at_the_least_of_the_other_aim() -> None:
+    """Of the many plans that deliver all, that of least cost ends the front; of a level a bit less is demanded."""
+    network = city().with_options(episode={"horizon": 2})
+    front = account_front(network, (network.services[0].id, "cost"), points=3)
+    cheapest = -bound(network, aim="cost", min_service=front.bounds[-1] - 1e-6).objective
+    assert front.demands[-1, 0] == pytest.approx(cheapest, rel=1e-4)
+    assert 1.0 - 1e-5 < _within_reach(1.0) < 1.0 and _within_reach(0.0) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -239,7 +239,11 @@ def _possible(network: Network, points: int, progress: ProgressReport) -> tuple[
 
 
 def _levels(least: float, most: float, points: int) -> list[float]:
-    """Return service levels from least to most, rounded down a little so that the most can be had."""
+    """Return service levels from least to most, rounded down a little so that the most can be had.
+
+    >>> _levels(0.12349, 0.98769, 3)
+    [0.1234, 0.5555, 0.9876]
+    """
     levels: Floats = np.linspace(least, most, points)
     return sorted({math.floor(level * 1e4) / 1e4 for level in levels.tolist()})
 
