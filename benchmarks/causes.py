@@ -99,6 +99,7 @@ VARIANTS = {
     "ppo_noise": Variant(
         "exploration e⁻² instead of e⁻¹ at first", parameters={"policy_kwargs": {"log_std_init": -2.0}}
     ),
+    "ppo_centred": Variant("the mean reward of all copies taken off", learner={"centre_rewards": True}),
     "ppo_critic": Variant("critics see the whole state", learner={"policy": "CentralCriticPolicy"}),
     "ppo_order": Variant(
         "arcs learn in the first half only, nodes throughout", match=[{"kind": "arc", "share_of_steps": 0.5}]

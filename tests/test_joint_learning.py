@@ -368,6 +368,53 @@ def test_time_limit_may_be_the_end() -> None:
     assert (paid[True][-1] != paid[False][-1]).all()
 
 
+@pytest.mark.parametrize("scheme", ["independent", "shared", "joint"])
+def test_centred_rewards_are_what_copies_differ_by(scheme: str) -> None:
+    """Of each agent the mean over the copies is taken off in every interval; what runs report stays."""
+    plain, centred = (_centred_or_not(scheme, "lockstep", centred) for centred in (False, True))
+    rewards = [
+        np.stack([model.rollout_buffer.rewards.reshape(8, -1, 3) for model in models]) for models, _ in (plain, centred)
+    ]
+    differences = rewards[0] - rewards[0].mean(axis=-1, keepdims=True, dtype=float)
+    np.testing.assert_allclose(rewards[1], differences, atol=1e-6)
+    assert np.abs(differences).max() > 1e-3
+    np.testing.assert_array_equal(plain[1], centred[1])
+    weights = [[part.detach() for part in models[0].policy.parameters()] for models, _ in (plain, centred)]
+    stacked = _centred_or_not(scheme, "stacked", True)[0][0].policy.parameters()
+    for part_centred, part_stacked in zip(weights[1], stacked, strict=True):
+        torch.testing.assert_close(part_stacked.detach(), part_centred, atol=1e-5, rtol=1e-4)
+    assert max(float((part - other).abs().max()) for part, other in zip(*weights, strict=True)) > 1e-4
+
+
+def _centred_or_not(scheme: str, engine: str, centred: bool) -> tuple[list[Any], NDArray[np.floating]]:
+    """Return the models of an episode in three copies, and the returns that each row reports."""
+    about: dict[str, Any] = {"scheme": scheme, "normalise": NOTHING, "bootstrap": False, "centre_rewards": centred}
+    spec = LearnerSettings(algorithm="PPO", parameters=SMALL | {"batch_size": 8}, **about)
+    options: dict[str, Any] = {"horizon": 8, "steps": 24, "envs": 3, "engine": engine}
+    training = train("copper_net", small(spec, environment={"reward": "local"}), **options)
+    learners = training.learners.values()
+    returns = np.concatenate([learner.agent_env.last_step.returns for learner in learners])
+    return [learner.model for learner in learners], returns
+
+
+def test_centred_rewards_are_kept_in_replay_buffers_and_need_copies(tmp_path: Path) -> None:
+    """Off-policy learners keep what copies differ by; one copy is refused by name, and recipes of old stay."""
+    spec = LearnerSettings(
+        algorithm="TD3", parameters={"buffer_size": 16, "learning_starts": 100}, normalise=NOTHING, centre_rewards=True
+    )
+    training = train("copper_net", small(spec), horizon=8, steps=16, envs=2)
+    for learner in training.learners.values():
+        model: Any = learner.model
+        rewards = model.replay_buffer.rewards
+        np.testing.assert_allclose(rewards.sum(axis=1), 0.0, atol=1e-6)
+        assert np.abs(rewards).max() > 0.0
+    with pytest.raises(cirl_marl.CirlError, match=r"learner\.centre_rewards: in a single copy .* envs of at least 2"):
+        train("copper_net", small(spec), horizon=8, steps=16, envs=1, directory=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+    assert "centre_rewards" not in LearnerSettings(algorithm="TD3").model_dump()
+    assert spec.model_dump()["centre_rewards"] is True
+
+
 def test_weight_of_circularity_is_an_option(tmp_path: Path) -> None:
     """The reward follows it, a run keeps it as an option beside the unchanged definition, and bad values are named."""
     half, most = (vector_env("copper_net", num_envs=2, reward="team", circularity_weight=w) for w in (None, 0.9))

@@ -96,6 +96,7 @@ class AgentVecEnv(VecEnv):
         action: its last one.
         wait: returns when every learner has handed in its actions and the joint environment has moved.
         bootstrap: whether time limits are reported as truncations, after which the learner expects more to come.
+        centre_rewards: whether rewards are r − mean of r over the agent's copies, which are all in the same interval.
     """
 
     def __init__(self, env: BatchedEnv, name: str, view: View, row: Callable[..., Any] = AgentInNetworkCopy) -> None:
@@ -103,7 +104,7 @@ class AgentVecEnv(VecEnv):
         self.name, self.view, self.copies = name, view, env.num_envs
         self.last_step: StepResult = _NO_STEP
         self.action: NDArray[np.float32] | None = None
-        self.bootstrap = True
+        self.bootstrap, self.centre_rewards = True, False
         self.views = [row(env, i, agent) for agent in view.row_agents or (None,) for i in range(self.copies)]
         self.wait: Callable[[], object] = wait
         super().__init__(len(self.views), view.observation_space, view.action_space)
@@ -141,7 +142,11 @@ class AgentVecEnv(VecEnv):
 
     def rewards_and_dones(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Return the reward of each row, and whether its episode ended; copies, as PPO adds to rewards in place."""
-        return self.last_step.rewards.copy(), self.last_step.dones.copy()
+        rewards = self.last_step.rewards.copy()
+        if self.centre_rewards:
+            by_agent = rewards.reshape(-1, self.copies)
+            by_agent -= by_agent.mean(axis=1, keepdims=True)
+        return rewards, self.last_step.dones.copy()
 
     def reset(self) -> VecEnvObs:
         """Return the current observation of every copy."""

@@ -192,6 +192,7 @@ def prepare(
     if not env.agents:
         raise CirlError(f"network '{env.network.name}': no compartment has a control, so nothing can learn")
     full_recipe.check_agents(env.agents)
+    full_recipe.check_copies(copies)
     settings.pop("scenario", None)
     task: dict[str, Any] = {"network": env.network.name, "scenario": env.network.scenario_name, "agents": env.agents}
     task |= {"recipe": full_recipe, "seed": whole_number("seed", seed, 0), "steps": steps, "envs": copies}

@@ -79,7 +79,7 @@ class Learner:
         self.name = agent_env.name
         self.spec = spec
         self.agent_env = agent_env
-        agent_env.bootstrap = spec.bootstrap
+        agent_env.bootstrap, agent_env.centre_rewards = spec.bootstrap, spec.centre_rewards
         self._seed = derived_seed(seed, agent_env.name, done)
         self.barrier = CheckpointBarrier(agent_env)
         self._first_timestep = 0

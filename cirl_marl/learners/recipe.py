@@ -154,6 +154,7 @@ class Start(Settings):
 class LearnerSettings(Settings):
     """One algorithm with its parameters."""
 
+    LATER = ("centre_rewards",)
     algorithm: str
     policy: str = Field("MlpPolicy", description="CentralCriticPolicy lets the critic see the whole state")
     scheme: Scheme = Field(
@@ -170,6 +171,11 @@ class LearnerSettings(Settings):
     normalise: Normalisation = Normalisation()
     bootstrap: StrictBool = Field(
         True, description="whether the learner expects more to come after a time limit; if not, the episode is all"
+    )
+    centre_rewards: StrictBool = Field(
+        False,
+        description="whether the mean reward over the copies is taken off in each interval: what time alone brings is "
+        "far more than an action does, and critics need to see that. Needs several copies",
     )
     share_of_steps: Annotated[Number, Field(ge=0, le=1)] = Field(
         1.0, description="share of the run during which the agent learns; after it, it only acts; 0 needs a start"
@@ -345,6 +351,14 @@ class Recipe(Settings):
             for i, match in enumerate(self.match)
             for agent in match.agents or ()
             if agent not in agents
+        )
+
+    def check_copies(self, copies: int) -> None:
+        """Raise a ``RecipeError`` that names learners who compare copies where there is but one."""
+        self._refuse(
+            f"{place}.centre_rewards: in a single copy nothing is left of them; give envs of at least 2"
+            for place, learner in self.learners()
+            if learner.centre_rewards and copies == 1
         )
 
     def _refuse(self, mistakes: Iterable[str]) -> None:

@@ -112,9 +112,8 @@ def train_tuned(
         return _train_network(environment, recipe, row, report, settings)
     plain = LearnerSettings(algorithm=learner.algorithm)
     surplus = ["environment"] if recipe.environment else []
-    surplus += [
-        key for key in ("scheme", "share_of_steps", "bootstrap") if getattr(learner, key) != getattr(plain, key)
-    ]
+    network_settings = ("scheme", "share_of_steps", "bootstrap", "centre_rewards")
+    surplus += [key for key in network_settings if getattr(learner, key) != getattr(plain, key)]
     if surplus:
         raise RecipeError(f"{agents}: {environment.name} learns in copies: leave out {', '.join(surplus)}")
     if environment.has_goals:
