@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
@@ -29,6 +30,7 @@ from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.network import Floats
 from cirl_marl.optimum import Bound, bound, improve, improve_plan, simulate_plan
 from cirl_marl.optimum.linearised import jacobians
+from cirl_marl.optimum.step_supplies import IdleSupplies
 
 AGENTS = ("recycle", "exports")
 
@@ -101,12 +103,12 @@ def test_plans_and_mpc_keep_yearly_budgets_that_a_constant_plan_keeps() -> None:
     assert run.episode_levels.min() >= 0.9 - 2e-3
 
 
-def around(actions: float) -> tuple[Bound, Dynamics]:
+def around(actions: float, agents: Sequence[str] = AGENTS) -> tuple[Bound, Dynamics]:
     """Return a plan of constant actions, and the dynamics of its network."""
     network = harbour(horizon=8)
     nodes = [replace(node, initial=(112.0, 112.0)) if node.id == "use" else node for node in network.nodes]
     network = replace(network, nodes=tuple(nodes))
-    solved = bound(network, agents=AGENTS, min_service=0.9, at_most={"emissions": 1e3})
+    solved = bound(network, agents=agents, min_service=0.9, at_most={"emissions": 1e3})
     return replace(solved, actions=np.full_like(solved.actions, actions)), Dynamics(network)
 
 
@@ -151,6 +153,40 @@ def test_supplies_of_a_step_begin_where_the_service_gets_short() -> None:
     network = replace(dynamics.network, services=(short,))
     supplies = jacobians(replace(plan, network=network), Dynamics(network)).supplies
     assert (supplies.low == 0).all() and (supplies.high == 0).all() and (supplies.beyond < 0).all()
+
+
+def test_supplies_that_are_about_to_begin_or_to_end_are_free() -> None:
+    """Within a millionth of what is demanded, and of the most; what is to hold others holds no such one."""
+    plan, dynamics = around(-0.7)
+
+    def supplies_at(actions: float) -> IdleSupplies:
+        return jacobians(replace(plan, actions=np.full_like(plan.actions, actions)), dynamics).supplies
+
+    def second(actions: float) -> tuple[float, float, bool]:
+        supplies = supplies_at(actions)
+        is_free = supplies.at_need().high[1, 0] > 0
+        return float(supplies.beyond[1, 0]), float(supplies.amount[1, 0]), bool(is_free)
+
+    begins, ends = -0.9, -0.7  # recycling at which the second interval needs supplies, and none
+    for _ in range(30):
+        middle = (begins + ends) / 2
+        is_needed = supplies_at(middle).low[1, 0] < 0
+        begins, ends = (middle, ends) if is_needed else (begins, middle)
+    assert second(ends + 2e-5) == (0.0, 0.0, True)
+    beyond, amount, is_free = second(ends + 2e-4)
+    assert beyond > 2e-4 and amount == 0.0 and not is_free
+    assert second(begins - 4e-6) == (0.0, 0.0, True)
+    beyond, amount, is_free = second(begins - 4e-5)
+    assert beyond == 0.0 and amount > 2e-4 and is_free
+
+
+def test_what_an_agent_supplies_is_no_part_of_what_idle_arcs_bring() -> None:
+    """Imports by a decision, and mines beside them that bring the rest."""
+    plan, dynamics = around(-0.9, (*AGENTS, "imports"))
+    supplies, run = jacobians(plan, dynamics).supplies, simulate_plan(plan)
+    mines = run.flow[:, [dynamics.network.arc_index[f"mine_{name}"] for name in "ab"]]
+    assert mines.sum() > 8 * 5.0
+    np.testing.assert_allclose(supplies.amount[:, 0], mines.sum(axis=1) - 4.0, atol=1e-9)
 
 
 def test_the_plan_that_is_least_short_counts(monkeypatch: pytest.MonkeyPatch) -> None:

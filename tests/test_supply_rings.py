@@ -132,7 +132,7 @@ def test_supplies_solve_every_linear_problem(seed: int) -> None:
     assert (lack[found > most * 1e-12] >= -1e-9 * scale[found > most * 1e-12]).all()
 
 
-@pytest.mark.parametrize("seed", [303, 795, 2362, 3801, 3967, 4254, 10771, 25964])
+@pytest.mark.parametrize("seed", [303, 795, 1151, 2362, 3801, 3967, 4254, 10771, 25964, 28791])
 def test_pivots_solve_problems_in_which_ratios_tie(seed: int) -> None:
     """Whole numbers make equal rows and ratios, and equations of which some follow from others."""
     rng = np.random.default_rng(seed)
@@ -150,6 +150,15 @@ def test_pivots_solve_problems_in_which_ratios_tie(seed: int) -> None:
     lack = (shortage - slope @ (found - now)) / (np.abs(shortage) + slope @ most + 1e-9)
     assert ((found >= 0) & (found <= most)).all()
     assert (lack[found < most] < 1e-12).all() and (lack[found > 0] > -1e-12).all()
+
+
+@pytest.mark.parametrize("interval", [0.01, 1.0, 7.0])
+def test_supplies_of_which_too_little_arrives_stay(interval: float) -> None:
+    """A thousand millionth of them at least, of a shorter interval as a part of that."""
+    for part, is_more in ((3e-10, False), (3e-9, True)):
+        slope = np.array([[[part * min(1.0, interval)]]])
+        shortage, now, most = (np.array([[value]]) for value in (1.0, 2.0, 5.0))
+        assert complementary(slope, shortage, now, most, interval)[0, 0] == (5.0 if is_more else 2.0)
 
 
 def test_pivots_leave_what_is_supplied_where_it_does_not_arrive() -> None:

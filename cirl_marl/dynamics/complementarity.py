@@ -53,8 +53,8 @@ def _active_set(slope: Floats, shortage: Floats, supply: Floats, most: Floats, a
     target = shortage + (slope * supply[:, None]).sum(axis=2)
     at_bound = np.where(shortage > 0, supply >= most, supply <= 0)  # as if what lacks now lacked still
     free = arrives & (most > 0) & ~at_bound
-    pinned_values: Floats = np.where(arrives & ~at_bound, 0.0, supply)
-    solution, is_solved, unit = supply.copy(), np.zeros(len(supply), dtype=bool), np.eye(supply.shape[1])
+    solution, pinned_values = supply.copy(), supply.copy()
+    is_solved, unit = np.zeros(len(supply), dtype=bool), np.eye(supply.shape[1])
     for _ in range(CHANGES):
         left = np.flatnonzero(~is_solved)
         a, b, pinned, high = (array[left] for array in (slope, target, pinned_values, most))
