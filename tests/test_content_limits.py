@@ -15,7 +15,11 @@ from test_changing_contents import NOISE, mine
 from test_substances import sorter, sorting_line, substances_networks
 
 from cirl_marl import (
+    MPC,
     Arc,
+    CirlError,
+    Control,
+    ControlKind,
     DefinitionError,
     Law,
     MultiAgentVectorEnv,
@@ -28,6 +32,7 @@ from cirl_marl import (
     load_network,
     simulate_plan,
 )
+from cirl_marl.controllers.rollout import episode_start
 from cirl_marl.definitions.writer import definition_of
 from cirl_marl.network.disturbances import DisturbanceEffect
 from cirl_marl.network.reachable_contents import reachable_contents
@@ -220,3 +225,18 @@ def test_a_plan_from_an_empty_stock_is_simulated() -> None:
     network = replace(network, nodes=nodes, services=(clean,))
     run = simulate_plan(bound(network, initial={"ore": 500.0, "scrap": 100.0, "use": 0.0}, degree=1))
     assert 0 < run.episode_levels[0, 0] <= 1
+
+
+@pytest.mark.parametrize("horizon", [None, 3])
+def test_mpc_tells_what_is_out_of_reach(horizon: int | None) -> None:
+    """Ore is too scarce to dilute so many products, which no single content tells."""
+    network = sorter(low=0.0, high=0.01)
+    control = Control(kind=ControlKind.FLOW, low=0.0, neutral=1.0, high=2.0)
+    arcs = tuple(replace(arc, control=control) if arc.id == "mined" else arc for arc in network.arcs)
+    network = replace(network, arcs=arcs)
+    with pytest.raises(CirlError, match=r"no actions reach a mean service level of 1 of 'products'"):
+        bound(network, min_service=1.0)
+    for demand, is_reached in ((1.0, False), (0.5, True)):
+        controller, env = MPC(horizon=horizon, min_service=demand), MultiAgentVectorEnv(network, num_envs=1)
+        episode_start(env).play(env, controller)
+        assert ("no plan was found that keeps services; this one has" in controller.note) != is_reached

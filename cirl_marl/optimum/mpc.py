@@ -272,12 +272,12 @@ class MPC(Planner):
         self._look_ahead(range(env.num_envs))
         for copy in range(env.num_envs):
             self._plans.append(self._next(copy, None))
-            self._note_excess(self._common_outlook or self._plans[copy].window)
+            self._note_faults(self._common_outlook or self._outlooks.get(copy) or self._plans[copy].window)
             progress((copy + 1) / env.num_envs)
 
-    def _note_excess(self, plan: WindowPlan | None) -> None:
-        """Say what a first plan exceeds of a budget, and what it lacks of a service beside one."""
-        if plan is None or not len(plan.task.limits):
+    def _note_faults(self, plan: WindowPlan | None) -> None:
+        """Say what a first plan of all intervals exceeds of a budget, and what it lacks of a service."""
+        if plan is None:
             return
         network = self._env.network
         excess = plan.bookings.sum(axis=0) - plan.task.limits
@@ -287,7 +287,8 @@ class MPC(Planner):
             lacks = zip(network.services, (plan.task.demand - plan.level).tolist(), strict=True)
             faults += [f"{lack:.4f} less of '{service.id}'" for service, lack in lacks if lack > NOTABLE]
         if faults:
-            self.note = f"no plan was found that keeps services and budgets; this one has {', '.join(faults)}"
+            demands = "services and budgets" if self._aims.budgets else "services"
+            self.note = f"no plan was found that keeps {demands}; this one has {', '.join(faults)}"
 
     def act(self, observations: Arrays) -> Arrays:
         """Return the next actions, from the current state of the environment that was started.
