@@ -142,6 +142,37 @@ def test_infos_hold_what_each_interval_and_the_episode_book() -> None:
     assert (final["episode_emissions"] > 0).all() and (sums > 0).all()
 
 
+def test_infos_hold_what_regions_and_compartments_book() -> None:
+    """An arc books where its donor is, or else where it leads to; what is of no region is in the total alone."""
+    network = booked(city(), 3)
+    ids = [node.id for node in network.nodes]
+    copies = {"south": (ids[0], ids[3]), "north": (ids[1],)}
+    network = replace(network, copies=copies)
+    env = MultiAgentVectorEnv(network, num_envs=2, horizon=3)
+    env.reset(seed=1)
+    *_, infos = env.step({agent: np.full((2, 1), 0.3) for agent in env.agents})
+    info = infos[env.agents[0]]
+    regional, entries = info["region_accounts"], info["entries"].T
+    assert entries.shape == (len(env.ledger.compartments), 2) and [*regional] == ["north", "south"]
+    sums = {(region, account.id): np.zeros(2) for region in ("", *copies) for account in ACCOUNTS}
+    places = {arc.id: (arc.donor, arc.recipient) for arc in network.arcs} | {id_: (id_,) for id_ in ids}
+    for compartment, account, amount in zip(env.ledger.compartments, env.ledger.account, entries, strict=True):
+        regions = [region for place in places[compartment] for region, nodes in copies.items() if place in nodes]
+        sums[(regions or [""])[0], ACCOUNTS[account].id] += amount
+    assert all(amount.any() for amount in sums.values())
+    for account in ACCOUNTS:
+        for region in copies:
+            np.testing.assert_allclose(regional[region][account.id], sums[region, account.id], rtol=1e-12)
+        total = sum(sums[region, account.id] for region in ("", *copies))
+        np.testing.assert_allclose(info["accounts"][account.id], total, rtol=1e-12)
+    with pytest.raises(ValueError, match="read-only"):
+        regional["north"]["cost"][0] = 0.0
+    parallel = parallel_env(network, horizon=3)
+    parallel.reset(seed=1)
+    *_, infos = parallel.step({agent: np.full(1, 0.3) for agent in parallel.agents})
+    assert infos[env.agents[0]]["region_accounts"]["south"]["cost"] == regional["south"]["cost"][0]
+
+
 def test_vector_rewards_add_up_to_what_is_reported() -> None:
     """λ̄, levels and totals of an episode, each by itself, and the same for all; a finished episode pays nothing."""
     env = mo_parallel_env(city(), horizon=4)

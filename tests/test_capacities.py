@@ -103,6 +103,30 @@ def least_cost(available: Series | float = 1.0) -> float:
     return float(found.fun)
 
 
+@pytest.mark.parametrize(("life", "years", "interest"), [(15, 10, 0.05), (7, 7, 0.1), (20, 3, 0.02)])
+def test_an_annuity_on_what_is_held_is_the_investment_less_its_salvage(life: int, years: int, interest: float) -> None:
+    """By hand: a plant built before the start costs, until the end, I less what is left of its annuities then.
+
+    Amounts of a year count in its middle, so that the total is that of annuities at ends of years times √(1 + i).
+    """
+    investment, units = 1000.0, 2.0
+    annuity = investment * interest / (1 - (1 + interest) ** -life)
+    plant = Node(id="plant", initial=(units, units), holding={"cost": annuity})
+    arc = Arc(id="build", donor="makers", recipient="plant", law=Law.CONTROLLED, control=replace(ORDER, neutral=0.0))
+    network = Network(
+        name="annuity",
+        nodes=(Node(id="makers", initial=(9.0, 9.0)), plant),
+        arcs=(arc,),
+        episode=Episode(control_interval=1.0, horizon=years),
+        time_unit="year",
+        accounts=(Account(id="cost", unit="EUR_2023", discount=interest),),
+    )
+    total = rollout(MultiAgentVectorEnv(network, num_envs=1), Neutral()).accounts[0, 0]
+    left = sum(annuity / (1 + interest) ** year for year in range(1, life - years + 1))
+    by_hand = units * (investment - left / (1 + interest) ** years)
+    assert total == pytest.approx(by_hand * (1 + interest) ** 0.5, rel=1e-12)
+
+
 @pytest.mark.parametrize("available", [1.0, Series(times=(0.0, 12.0, 20.0), values=(1.0, 0.6, 0.9))])
 def test_least_cost_of_two_technologies_is_that_of_a_program_by_hand(available: Series | float) -> None:
     """Built, aged, retired and run as a linear program of two technologies over 30 years has it, to 1e-6."""

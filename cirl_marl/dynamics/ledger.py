@@ -29,6 +29,7 @@ class Ledger:
 
     Attributes:
         accounts: ids of the accounts.
+        regions: that entries are of, of networks of copies.
         compartments: id of the compartment that each entry is of.
         account: position of the account of each entry, shape (entries,).
         discount: by which amounts of each interval are multiplied in totals, shape (accounts, horizon).
@@ -71,6 +72,13 @@ class Ledger:
         controls = network.control_bounds.shape[1] if self.has_efforts else 0
         self._charged = RowSum(rows_of_entries, columns, 1.0, (len(entries), arcs + stores + controls))
         self._by_account = RowSum(self.account, range(len(entries)), 1.0, (len(self.accounts), len(entries)))
+        regions = [network.region_of(compartment) for compartment in self.compartments]
+        self.regions = tuple(sorted({*regions} - {""}))
+        of_regions: Integers = np.flatnonzero([bool(region) for region in regions])
+        ranks = np.array([self.regions.index(region) for region in regions if region], dtype=np.intp)
+        shape = len(self.regions) * len(self.accounts), len(entries)
+        cells = ranks * len(self.accounts) + self.account[of_regions]
+        self._by_region = RowSum(cells, of_regions, 1.0, shape)
         horizon = network.episode.horizon
         rates = [entry[3] for entry in entries]
         table = np.array(rates).reshape(len(entries), horizon)
@@ -149,6 +157,10 @@ class Ledger:
     def sums(self, entries: Floats) -> Floats:
         """Return the amount on each account, shape (accounts, B), of those of entries."""
         return self._by_account(entries)
+
+    def regional_sums(self, entries: Floats) -> Floats:
+        """Return what each region books on each account, shape (regions, accounts, B), of amounts of entries."""
+        return self._by_region(entries).reshape(len(self.regions), len(self.accounts), entries.shape[1])
 
     def rates(self, *, with_discount: bool = True) -> tuple[Floats, Floats, Floats]:
         """Return what totals have of mean flows, of mean stocks, and of convex parts in each interval.

@@ -332,6 +332,8 @@ class MultiAgentVectorEnv:
         ``cost_SERVICE``       shortfall 1 − level of each service, shape (B,)
         ``cost``               sum of the shortfalls, shape (B,): what safe reinforcement learning keeps below a budget
         ``accounts``           amount booked on each account in the interval, a dict account → shape (B,), if any
+        ``entries``            amounts booked by ``ledger.compartments`` on ``ledger.account``, shape (B, entries)
+        ``region_accounts``    a dict region → account → amount, shape (B,), in a network of copies
         ``substances``         mean flows of each substance, a dict substance → (B, arcs), mass/time, if there are any
         ``drawn``              with ``uncertain``: factors in the order of ``network.uncertain``, shape (B, numbers)
         ``disturbances``       their values in the interval, a dict disturbance → shape (B,), if there are any
@@ -357,6 +359,13 @@ class MultiAgentVectorEnv:
         if self.ledger.accounts:
             outcome.bookings.setflags(write=False)
             info["accounts"] = dict(zip(self.ledger.accounts, outcome.bookings, strict=True))
+            info["entries"] = outcome.entries.T
+            info["entries"].flags.writeable = False
+        if self.ledger.regions:
+            amounts = self.ledger.regional_sums(outcome.entries)
+            amounts.setflags(write=False)
+            by_region = (dict(zip(self.ledger.accounts, region, strict=True)) for region in amounts)
+            info["region_accounts"] = dict(zip(self.ledger.regions, by_region, strict=True))
         if self.network.substances:
             flows = self.physical.substances.reshape(len(self.network.substances), -1, self.num_envs)
             flows.flags.writeable = False

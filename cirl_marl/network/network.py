@@ -127,6 +127,16 @@ class Network(Specification):
                 return part.id.removeprefix(f"{region}_")
         return None
 
+    def region_of(self, compartment: str) -> str:
+        """Return the region whose copy a compartment is of; of an arc, that of its donor before its recipient's."""
+        part = self.compartments[compartment]
+        places = [part.donor, part.recipient] if isinstance(part, Arc) else [part.id]
+        return next((self._region_of_nodes[place] for place in places if place in self._region_of_nodes), "")
+
+    @cached_property
+    def _region_of_nodes(self) -> Mapping[str, str]:
+        return {node: region for region, nodes in self.copies.items() for node in nodes}
+
     @cached_property
     def _nodes_of_copies(self) -> Mapping[str, frozenset[str]]:
         return {region: frozenset(nodes) for region, nodes in self.copies.items()}

@@ -35,15 +35,12 @@ def write_accounts(folder: Path, name: str, simulation: Simulation, title: str) 
 def accounts_table(simulation: Simulation) -> tuple[list[str], list[list[object]]]:
     """Return header and rows: what each compartment books on each account in the episode, the largest amounts first."""
     network, amounts = simulation.network, simulation.rollout.entries
-    regions = {node: region for region, nodes in network.copies.items() for node in nodes}
     rows: list[list[object]] = []
     for place, account in enumerate(network.accounts):
         for compartment, entries, total in _by_compartment(simulation, place):
-            part = network.compartments[compartment]
-            ends = [getattr(part, end, "") for end in ("id", "donor", "recipient")]
-            region = next((regions[end] for end in ends if end in regions), "")
+            label, region = network.compartments[compartment].label, network.region_of(compartment)
             amount = float(amounts[:, entries].sum())
-            rows.append([account.id, compartment, part.label, region, amount, total, account.unit])
+            rows.append([account.id, compartment, label, region, amount, total, account.unit])
     header = ["account", "compartment", "title", "region", "amount", "discounted", "unit"]
     return header, rows
 

@@ -27,7 +27,6 @@ from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.calendar import elapsed_time, in_years, year
 from cirl_marl.network.declarations import positional_record
-from cirl_marl.network.elements import Arc
 from cirl_marl.records.files import read_content, write_atomically, write_table
 from cirl_marl.records.machine import versions
 
@@ -142,7 +141,6 @@ def _series(network: Network, control: str) -> Iterator[YearlyRow]:
     scenario = f"{network.name} {network.scenario_name} {control}"
     own = network.region or WORLD
     scale = elapsed_time(2001, 2000, network.time_unit)
-    regions = {node: region for region, nodes in network.copies.items() for node in nodes}
 
     def row(region: str, variable: str, unit: str, values: Callable[[Rollout], Floats]) -> YearlyRow:
         return [model, scenario, region, variable, unit], values
@@ -152,10 +150,8 @@ def _series(network: Network, control: str) -> Iterator[YearlyRow]:
 
     def place(id_: str) -> tuple[str, str]:
         """Return the region of a compartment, and its name there."""
-        part, name = network.compartments[id_], network.counterpart(id_)
-        ends = (part.donor, part.recipient) if isinstance(part, Arc) else (id_,)
-        copied = next((regions[end] for end in ends if end in regions), own)
-        return (own, id_) if name is None else (copied, name)
+        name = network.counterpart(id_)
+        return (own, id_) if name is None else (network.region_of(id_), name)
 
     yield row(own, "Circularity", mass, lambda run: run.circularity_mean[0])
     for s, service in enumerate(network.services):
