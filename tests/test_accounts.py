@@ -146,7 +146,8 @@ def test_infos_hold_what_regions_and_compartments_book() -> None:
     """An arc books where its donor is, or else where it leads to; what is of no region is in the total alone."""
     network = booked(city(), 3)
     ids = [node.id for node in network.nodes]
-    copies = {"south": (ids[0], ids[3]), "north": (ids[1],)}
+    between = next(arc for arc in network.arcs if arc.accounts)
+    copies = {"south": (between.donor,), "north": (between.recipient,)}
     network = replace(network, copies=copies)
     env = MultiAgentVectorEnv(network, num_envs=2, horizon=3)
     env.reset(seed=1)
