@@ -55,7 +55,7 @@ SIMPLE = ("neutral", "plan", "rule")
 """Contenders of ``benchmarks.uncertain``, whose knobs are set there."""
 PLANNERS = ("mpc", "scenario_mpc", "price_policy")
 """Contenders that solve a program for every decision, of which fewer episodes are measured."""
-LEARNERS = ("exact_gradients", "guided_ppo")
+LEARNERS = ("exact_gradients", "guided_ppo", "guided_td3")
 """Recipes of independent learners, who see what is local; prices in their training see to their service."""
 NEVER = -1
 LATE = {"at once": 0, "an interval late": 1, "four intervals late": 4, "never": NEVER}

@@ -73,6 +73,7 @@ RECIPES = (
     "independent_ppo",
     "central_critic_ppo",
     "guided_ppo",
+    "guided_td3",
     "shared_ppo",
     "mappo",
     "joint_ppo",
