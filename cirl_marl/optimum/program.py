@@ -42,6 +42,7 @@ from cirl_marl.optimum.matrices import BEFORE, NOW, ChainedRows, IntervalCache, 
 from cirl_marl.optimum.mixtures import content_rows, mixture_rows
 from cirl_marl.optimum.quasi_steady import decay_rows, end_laws, has_fast_stocks, quasi_steady_rows
 from cirl_marl.optimum.reach import ComparisonSystem, Reach
+from cirl_marl.optimum.shortages import shortage_rows
 from cirl_marl.optimum.transit import ConstantShares, Transit, steady_rows
 from cirl_marl.optimum.vintages import Lifetimes
 
@@ -232,6 +233,7 @@ class Programs:
         rows = ProgramRows(layout, steps)
         valve_envelopes(admissible, reach, intervals, rows)
         idle_supplies(admissible, reach, intervals, rows)
+        shortage_rows(admissible, self.system, reach, initial, intervals, rows)
         least_deliveries(admissible, reach, intervals, rows)
         order_rows(admissible, reach, intervals, rows)
         low, high = _box(admissible, reach, lifetime_flow, layout, period)

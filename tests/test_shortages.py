@@ -1,0 +1,219 @@
+"""A stock that idle arcs make up for falls short only while these supply the most that they can."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from benchmarks.yearly import Family, yearly_network
+from cirl_marl import (
+    Arc,
+    Control,
+    ControlKind,
+    Episode,
+    Law,
+    MultiAgentVectorEnv,
+    Network,
+    Node,
+    Role,
+    Service,
+    bound,
+)
+from cirl_marl.dynamics.supply import NOTABLE
+from cirl_marl.network.elements import Lifetime
+from cirl_marl.optimum import simulate_plan
+from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.matrices import ProgramRows
+from cirl_marl.optimum.options import starting_stocks
+from cirl_marl.optimum.program import Programs, possible_range
+from cirl_marl.optimum.shortages import shortage_rows
+
+Floats = NDArray[np.float64]
+YEARS, LIFE, DEMAND, START = 12, 8.0, 100.0, 110.0
+SUPPLIED = Family(years=(4, 12), regions=(1, 1), products=(1, 4), lifetimes=(0, 4), supplied=1.0, idle=1.0)
+
+
+def flow(high: float) -> Control:
+    """Return the control of a flow from 0 on."""
+    return Control(kind=ControlKind.FLOW, low=0.0, neutral=0.0, high=high)
+
+
+def village(high: float = 9.0, ore: float = 1e6, use: dict[str, Any] | None = None) -> Network:
+    """Return homes that a quarry makes up for; somebody may bring more from a pit."""
+    use = {"rate": 1.0 / LIFE} if use is None else use
+    nodes = (
+        Node(id="quarry", role=Role.NONRENEWABLE_RESERVOIR, initial=(ore, ore)),
+        Node(id="pit", role=Role.NONRENEWABLE_RESERVOIR, initial=(1e6, 1e6)),
+        Node(id="homes", initial=(START, START), **use),
+        Node(id="dump", role=Role.LANDFILL, initial=(0.0, 0.0)),
+    )
+    supply: dict[str, Any] = {"law": Law.CONTROLLED, "control": flow(high), "makes_up_for": "living"}
+    arcs = (
+        Arc(id="supply", donor="quarry", recipient="homes", **supply),
+        Arc(id="bring", donor="pit", recipient="homes", law=Law.CONTROLLED, control=flow(80.0)),
+        Arc(id="waste", donor="homes", recipient="dump", law=Law.SHARE),
+    )
+    return Network(
+        name="village",
+        nodes=nodes,
+        arcs=arcs,
+        services=(Service(id="living", provider="homes", quantity="stock", low=DEMAND),),
+        episode=Episode(control_interval=1.0, horizon=YEARS),
+        default_agents=("bring",),
+    )
+
+
+def rows_of(network: Network, *, merged: bool | None = None) -> tuple[Programs, Any, Floats]:
+    """Return the programs of a network, and the rows with their limits."""
+    admissible = Admissible.of(network)
+    programs = Programs(admissible, 2, None, merge_pieces=merged)
+    start, intervals = starting_stocks(admissible.lifetimes, None), range(network.episode.horizon)
+    reach = possible_range(admissible.lifetimes, programs.system, start, intervals)[0]
+    rows = ProgramRows(programs.layout, len(intervals))
+    shortage_rows(admissible, programs.system, reach, start, intervals, rows)
+    return programs, rows.matrices()[0], rows.limits()
+
+
+def room(network: Network, actions: Floats) -> Floats:
+    """Return what the rows leave open in episodes of some actions, shape (rows, copies); (steps, entries, copies)."""
+    programs, matrix, limits = rows_of(network)
+    layout, plan_network = programs.layout, programs.admissible.network
+    env = MultiAgentVectorEnv(network, num_envs=actions.shape[2])
+    env.reset(seed=0)
+    values = np.zeros((len(actions), layout.size, actions.shape[2]))
+    for value, action in zip(values, actions, strict=True):
+        flows = env.advance(action).flow
+        for place, store in enumerate(network.stores):
+            value[layout.end[-1] + plan_network.node_index[store.id]] = env.rows.stocks(env.physical.stock)[place]
+        for k, arc in enumerate(plan_network.arcs):
+            if arc.id in network.arc_index:
+                value[layout.flow + k] = flows[network.arc_index[arc.id]]
+    left: Floats = limits[:, None] - matrix @ values.reshape(-1, actions.shape[2])
+    return left
+
+
+def largest_shortages(network: Network) -> Floats:
+    """Return L of each interval, read off what the rows have of a supply."""
+    programs, matrix, _ = rows_of(network)
+    layout, k = programs.layout, programs.admissible.network.arc_index["supply"]
+    table = matrix.toarray().reshape(YEARS, YEARS, layout.size)[np.arange(YEARS), np.arange(YEARS)]
+    high = network.compartments["supply"].control
+    assert high is not None
+    slopes: Floats = -table[:, layout.flow + k].sum(axis=1) * float(high.high)  # type: ignore[arg-type]
+    return slopes
+
+
+def starved(high: float) -> Floats:
+    """Return what homes lack at the end of each year if nobody brings anything, by the closed form."""
+    stock, lacks = START, np.zeros(YEARS)
+    for year in range(YEARS):
+        stock = stock * np.exp(-1 / LIFE) + high * LIFE * (1 - np.exp(-1 / LIFE))
+        lacks[year] = max(0.0, DEMAND - stock)
+        stock = min(stock, DEMAND)
+    return lacks
+
+
+@pytest.mark.parametrize("high", [4.0, 11.0, 40.0])
+def test_a_stock_lacks_no_more_than_where_it_is_starved(high: float) -> None:
+    """L is what lacks in the simulator if nobody brings anything, and the row is met with what is tolerated."""
+    network = village(high)
+    np.testing.assert_allclose(largest_shortages(network), starved(high), atol=1e-6)
+    left = room(network, np.full((YEARS, 1, 1), -1.0)).ravel()
+    # of what is supplied by need more may be left open
+    is_starved = starved(high) > 0
+    tolerated = NOTABLE * (DEMAND + starved(high))
+    np.testing.assert_allclose(left[is_starved], tolerated[is_starved], rtol=1e-2)
+    assert left.min() > 0
+
+
+def test_an_exponential_lifetime_lacks_what_a_rate_lacks() -> None:
+    """Its program over all inflows, which may come at any time, comes to the same within its enclosures."""
+    use = {"lifetime": Lifetime(mean=LIFE, distribution="exponential")}
+    most, lacks = largest_shortages(village(9.0, use=use)), starved(9.0)
+    assert (most >= lacks - 1e-3).all()
+    np.testing.assert_allclose(most, lacks, atol=2e-3 * DEMAND)
+
+
+@pytest.mark.parametrize("distribution", ["normal", "weibull", "lognormal"])
+def test_a_flood_that_dies_out_at_once_is_allowed_for(distribution: str) -> None:
+    """Much that comes in one year dies together; what then lacks is below L, and more than without the flood."""
+    use = {"lifetime": Lifetime(mean=LIFE, deviation=0.25 * LIFE, distribution=distribution)}
+    network = village(10.0, use=use)
+    floods = np.full((YEARS, 1, YEARS), -1.0)
+    floods[np.arange(YEARS), 0, np.arange(YEARS)] = 1.0
+    left = room(network, floods)
+    assert left.min() > 0
+    # where what is tolerated is all that is left, q = D
+    assert (left < 1.01 * NOTABLE * DEMAND * 2).any()
+    assert largest_shortages(network)[0] == pytest.approx(max(0.0, DEMAND - _first_year(network)), abs=1e-2)
+    assert largest_shortages(network).max() > 0
+
+
+def _first_year(network: Network) -> float:
+    """Return the stock after a year in which all that can be is supplied, and nothing is brought."""
+    network = replace(network, services=(replace(network.services[0], low=1e6),))
+    env = MultiAgentVectorEnv(network, num_envs=1)
+    env.reset(seed=0)
+    env.advance(np.full((1, 1), -1.0))
+    return float(env.rows.stocks(env.physical.stock)[2, 0])
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_rows_hold_in_random_cycles(seed: int) -> None:
+    """Supplies that are scarce, enough or ample; actions that stay at their ends for long starve and flood stocks."""
+    network, rng = yearly_network(seed, SUPPLIED), np.random.default_rng(seed)
+    factor = float(rng.choice([0.3, 1.0, 3.0]))
+    arcs = [
+        replace(arc, control=replace(arc.control, high=factor * float(arc.control.high)))  # type: ignore[arg-type]
+        if arc.makes_up_for and arc.control is not None
+        else arc
+        for arc in network.arcs
+    ]
+    network = replace(network, arcs=tuple(arcs))
+    env = MultiAgentVectorEnv(network, num_envs=1)
+    shape, half = (network.episode.horizon, len(env.actuators.control_rows), 16), network.episode.horizon // 2
+    ends = rng.choice([-1.0, 1.0], (2, *shape[1:])).repeat([half, shape[0] - half], axis=0)
+    actions = np.where(rng.random(shape) < np.linspace(0.5, 1.0, shape[2]), ends, rng.uniform(-1, 1, shape))
+    assert room(network, actions).min(initial=0.0) >= 0
+
+
+@pytest.mark.parametrize("merged", [False, True])
+def test_what_nobody_can_change_is_bounded_by_what_happens(merged: bool) -> None:
+    """Where the supply is enough the bound is the episode, though 90 % of the service would do."""
+    network = village(40.0)
+    pit = replace(network.arcs[1], control=flow(1e-6))
+    network = replace(network, arcs=(network.arcs[0], pit, network.arcs[2]))
+    solution = bound(network, min_service=0.9)
+    run = simulate_plan(replace(solution, actions=np.full_like(solution.actions, -1.0)))
+    assert float(run.episode_levels.min()) == pytest.approx(1.0)
+    assert solution.verify().bound == solution.objective
+    assert solution.objective == pytest.approx(float(run.episode_circularity[0]), rel=1e-4)
+    assert solution.objective >= float(run.episode_circularity[0])
+
+
+def test_nothing_is_said_where_a_source_may_run_dry_or_a_route_be_closed() -> None:
+    """There a stock may lack while its arc supplies less than the most."""
+    assert rows_of(village(9.0, ore=30.0))[1].toarray().any(axis=1).sum() < YEARS
+    network = village(9.0)
+    gate = Control(kind=ControlKind.SHARE, low=0.0, neutral=0.5, high=1.0)
+    arcs = (
+        replace(network.arcs[0], recipient="market"),
+        *network.arcs[1:],
+        Arc(id="homing", donor="market", recipient="homes", law=Law.SHARE, control=gate),
+        Arc(id="scrapping", donor="market", recipient="dump", law=Law.SHARE),
+    )
+    nodes, agents = (*network.nodes, Node(id="market", stores=False)), ("bring", "homing")
+    network = replace(network, nodes=nodes, arcs=arcs, default_agents=agents)
+    assert not rows_of(network)[1].toarray().any()
+    starving = room(network, np.full((YEARS, 2, 1), -1.0))
+    assert starving.min() >= 0
+    half_open = tuple(
+        replace(arc, control=replace(gate, low=0.2)) if arc.id == "homing" else arc for arc in network.arcs
+    )
+    opened = replace(network, arcs=half_open)
+    assert rows_of(opened)[1].toarray().any(axis=1).all()
+    assert room(opened, np.random.default_rng(0).choice([-1.0, 1.0], (YEARS, 2, 40))).min() >= 0
