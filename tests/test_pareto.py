@@ -11,10 +11,11 @@ import pytest
 
 from cirl_marl.definitions.catalogue import folder, load_network
 from cirl_marl.errors import CirlError, RunError
+from cirl_marl.evaluation.baselines import FRONT
 from cirl_marl.evaluation.pareto import ParetoFront, pareto_front
 from cirl_marl.learners.recipe import load_recipe
 from cirl_marl.network import Network
-from cirl_marl.optimum import NoCertificate
+from cirl_marl.optimum import NoCertificate, bound
 from cirl_marl.report.tradeoffs import PARETO_FILES, write_front
 
 pytestmark = pytest.mark.medium
@@ -27,9 +28,13 @@ def swept(network: Network, directory: Path, **options: object) -> ParetoFront:
 
 def test_bounds_are_above_plans(bottles: Network, tmp_path: Path) -> None:
     """More service costs circularity; each plan delivers what was demanded and stays below its bound."""
-    found = pareto_front(bottles, directory=tmp_path, points=4)
+    shares = list[float]()
+    found = pareto_front(
+        bottles, directory=str(tmp_path), points=4, progress=lambda activity, share: shares.append(share)
+    )
+    assert shares == sorted(shares) and shares[0] == 0.0 and shares[-1] == 1.0 and len(set(shares)) > 8
     bounds, plans = found.of("bound"), found.of("plan")
-    assert len(bounds) == len(plans) >= 3
+    assert len(bounds) == len(plans) == 4
     assert (np.diff([each.service for each in bounds]) > 0).all()
     assert (np.diff([each.circularity for each in bounds]) <= 1e-9).all()
     for most, plan in zip(bounds, plans, strict=True):
@@ -37,6 +42,19 @@ def test_bounds_are_above_plans(bottles: Network, tmp_path: Path) -> None:
         assert plan.circularity <= most.circularity + 1e-9 or plan.service < most.service
         assert plan.circularity == pytest.approx(most.circularity, rel=0.05)
     assert list(tmp_path.iterdir()) == []
+    # from where service costs nothing to where no more can be had, in equal steps
+    assert bounds[0].circularity == pytest.approx(bound(bottles).objective, rel=1e-4)
+    assert bounds[1].circularity < bounds[0].circularity - 1e-3 * abs(bounds[0].circularity)
+    with pytest.raises(CirlError):
+        bound(bottles, min_service=bounds[-1].service + 3e-4)
+    np.testing.assert_allclose(np.diff([each.service for each in bounds], 2), 0.0, atol=2.1e-4)
+    # what their multipliers prove between them, and where each is solved just that
+    levels, proved = found.front.T
+    assert levels.shape == (FRONT,)
+    np.testing.assert_allclose(levels[[0, -1]], [bounds[0].service, bounds[-1].service], atol=1.1e-4)
+    assert (np.diff(proved) <= 1e-9).all() and (np.diff(proved, 2) <= 1e-6 * abs(proved).max()).all()
+    for most in bounds:
+        assert np.interp(most.service, levels, proved) == pytest.approx(most.circularity, rel=2e-2)
 
 
 @pytest.mark.slow

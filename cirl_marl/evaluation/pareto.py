@@ -233,7 +233,6 @@ def _possible(network: Network, points: int, progress: ProgressReport) -> tuple[
         episode = simulate_plan(improve_plan(solution, progress=report))
         service, circularity = float(episode.least_service[0]), float(episode.episode_circularity[0])
         results.append(Point(kind="plan", service=service, circularity=circularity))
-        progress("bounds and plans", (place + 1) / points)
     levels = np.linspace(least, most, FRONT)
     return tuple(results), np.stack([levels, Envelope(tuple(bounds)).at(min_service=levels[:, None])], axis=1)
 
