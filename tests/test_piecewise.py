@@ -52,7 +52,7 @@ from cirl_marl.network.series import means
 from cirl_marl.network.uncertainty import Spread
 from cirl_marl.optimum import improve_plan, simulate_plan
 from cirl_marl.optimum.draw_proofs import Sampling
-from cirl_marl.optimum.step_parts import account_shares
+from cirl_marl.optimum.step_parts import Efforts, Excesses, account_shares
 from cirl_marl.report.account_tables import account_steps, accounts_table
 from cirl_marl.report.data_package import read_package, write_package
 
@@ -192,8 +192,8 @@ def test_plans_climb_to_the_optimum_from_anywhere() -> None:
     assert -mpc.accounts[0, 0] == pytest.approx(solved.objective, rel=1e-2)
 
 
-def test_steps_of_plans_have_what_pieces_change_by() -> None:
-    """What the program of a small step charges is what the simulator books, and rows hold with no room to spare."""
+def leaking() -> Network:
+    """Return a store that leaks as it is steered; what leaks, what is held, and changes cost in pieces."""
     effort = PiecewiseRate(to=(0.3,), rates=(0.0, 5.0))
     rising = {"mass": PiecewiseRate(to=(1.0,), rates=(-1.0, 2.0)), "stock": PiecewiseRate(to=(90.0,), rates=(0.1, 1.0))}
     control = Control(kind=ControlKind.RATE, low=0.0, neutral=0.5, high=2.0)
@@ -201,7 +201,27 @@ def test_steps_of_plans_have_what_pieces_change_by() -> None:
     network = small({"store": 100.0, "sink": 0.0}, [out])
     nodes = (replace(network.nodes[0], holding={"cost": rising["stock"]}), network.nodes[1])
     arcs = (replace(out, accounts={"cost": rising["mass"]}, effort={"cost": effort}),)
-    network = replace(network, nodes=nodes, arcs=arcs, accounts=ACCOUNTS)
+    return replace(network, nodes=nodes, arcs=arcs, accounts=ACCOUNTS)
+
+
+def test_excesses_are_of_flows_of_mean_stocks_and_of_distances() -> None:
+    """Beyond their amounts, also where controls fall below their neutral value."""
+    network = leaking()
+    solved = bound(network, aim="cost")
+    actions = np.array([-0.95, 0.8, -0.6, 0.1, -1.0])[:, None]
+    plan, ledger, dynamics = replace(solved, actions=actions), Ledger(network), Dynamics(network)
+    run, efforts = simulate_plan(plan), Efforts.of(plan, np.ones(1, dtype=bool), 0)
+    ends = np.concatenate([run.stock, run.flow], axis=1)
+    excesses = Excesses.of(ledger, dynamics, efforts, run.start, ends)
+    stock = np.append(run.start[0], run.stock[:, 0])
+    subjects = {1.0: run.flow[:, 0], 90.0: (stock[1:] + stock[:-1]) / 2, 0.3: np.abs(actions[:, 0] + 0.5)}
+    expected = np.array([subjects[amount] - amount for amount in ledger.amounts[:, 0].tolist()]).T
+    np.testing.assert_allclose(excesses.beyond, expected, atol=1e-9)
+
+
+def test_steps_of_plans_have_what_pieces_change_by() -> None:
+    """What the program of a small step charges is what the simulator books, and rows hold with no room to spare."""
+    network = leaking()
     solved = bound(network, aim="cost", at_most={"emissions": 1.0})
     middle, program, moves, run, trial = small_step(solved, 0.0)
     ledger = Ledger(network)
