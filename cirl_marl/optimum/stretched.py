@@ -99,11 +99,9 @@ class _DiscardBounds:
     """Bounds of what leaves in an interval of masses by the stages that they have to go."""
 
     def __init__(self, survivors: Floats, turnover: Floats) -> None:
-        """Take what is left at the ends of cells, falling, and the least and most turnover of the interval."""
-        last, size = survivors[-1], len(survivors)
+        """Take what is left at the ends of cells, falling to 0, and the least and most turnover of the interval."""
         least, most = int(np.floor(turnover[0] / CELL)), int(np.ceil(turnover[1] / CELL))
-        after = np.concatenate([survivors, np.full(most + 2, last)])
-        cells = np.arange(size)
+        after, cells = np.append(survivors, np.zeros(most + 2)), np.arange(len(survivors))
         self._most = after[cells] - after[cells + 1 + most]
         self._least = np.maximum(after[cells + 1] - after[cells + least], 0.0)
 
