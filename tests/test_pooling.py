@@ -110,10 +110,14 @@ class Pooling:
         ]
 
 
-def haverly(most_x: float, price_b: float, optimum: float, envelope: float, **further: Source) -> Pooling:
+def haverly(
+    most_x: float, price_b: float, optimum: float, envelope: float, most: float = 600.0, **further: Source
+) -> Pooling:
     """Return a problem of Haverly (1978); that of Ben-Tal et al. (1994) has one source more."""
     sulfur = [{"sulfur": percent} for percent in (3.0, 1.0, 2.0)]
-    sources = {"a": Source(6.0, sulfur[0]), "b": Source(price_b, sulfur[1]), "c": Source(10.0, sulfur[2]), **further}
+    prices = {"a": 6.0, "b": price_b, "c": 10.0}
+    sources = {name: Source(price, part, most) for (name, price), part in zip(prices.items(), sulfur, strict=True)}
+    sources |= further
     products = {"x": Product(9.0, {"sulfur": 2.5}, most_x), "y": Product(15.0, {"sulfur": 1.5}, 200.0)}
     return Pooling(sources, {"pool": ("a", "b", *further)}, "c", products, optimum, envelope)
 
@@ -137,6 +141,7 @@ def ben_tal_5() -> Pooling:
 PROBLEMS = {
     "Haverly 1": haverly(100.0, 16.0, 400.0, 500.0),
     "Haverly 2": haverly(600.0, 16.0, 600.0, 1000.0),
+    "Haverly 2, larger sources": haverly(600.0, 16.0, 600.0, 1000.0, most=800.0),
     "Haverly 3": haverly(100.0, 13.0, 750.0, 875.0),
     "Ben-Tal 4": haverly(100.0, 16.0, 450.0, 550.0, d=Source(15.0, {"sulfur": 1.0}, 50.0)),
     "Ben-Tal 5": ben_tal_5(),

@@ -52,9 +52,10 @@ it promised, while that is no better or lacks service: a Jacobian costs as much 
 REFINEMENT_ROUNDS = 2
 """Most programs that are solved, each in an eighth of the time of the bound of steel_world: the first makes up for
 factors that vary in the bound's plan, the second for what is left to first order."""
-CONTENT_STARTS = 4
-"""Actions to begin from where contents are demanded. Random ones are ends and middles of ranges: of 24 such 8 lead to
-the optimum of Haverly's second pooling problem, of as many uniform ones 3."""
+CONTENT_STARTS, SMALL_STARTS, SMALL = 4, 16, 5000
+"""Actions to begin from where contents are demanded, where Jacobians have at most SMALL entries SMALL_STARTS. Random
+ones are ends and middles of ranges: of 24 such 8 lead to the optimum of Haverly's second pooling problem, of as many
+uniform ones 3; three miss it where sources have 800 t in place of 600."""
 LEAP = 2.0
 """Half-width of the trust region, all of the range, of a step to what is not made any more, as it is too impure."""
 DEARER = 10.0
@@ -89,14 +90,16 @@ def improve_plan(
         bound: with the actions to start from.
         rounds: most linear programs to solve, from each start.
         starts: how many actions to begin from: those of the bound, then random ones, constant in time and always the
-            same; None: 1, with services of contents CONTENT_STARTS.
+            same; None: 1, with services of contents CONTENT_STARTS, in small networks SMALL_STARTS.
         enough: asked of each episode that is better than those before, whether to stop there.
         progress: called with the share of them that is solved; 1 when no more are needed.
     """
-    if slopes_of(bound, Dynamics(bound.network)) > MOST_SLOPES:
+    slopes = slopes_of(bound, Dynamics(bound.network))
+    if slopes > MOST_SLOPES:
         return refine(bound, enough=enough, progress=progress)
     if starts is None:
-        starts = CONTENT_STARTS if any(service.substance for service in bound.network.services) else 1
+        content_starts = SMALL_STARTS if slopes <= SMALL else CONTENT_STARTS
+        starts = content_starts if any(service.substance for service in bound.network.services) else 1
     trials = Trials(simulate_plan, lambda run, price: penalised_objective(bound, run, price), demand(bound))
     plans: list[Bound] = []
     for start in range(starts):
