@@ -158,7 +158,8 @@ class MPC(Planner):
     less what is planned for after it, with an equal part of the deviation for each interval to come. Beside them a
     service that is not ahead of its demand is dearer. Budgets of the episode hold in expectation: what is booked costs
     (1 − ε) of their multiplier, and what a window has beyond such a part (1 + ε). So a copy pays nearly the same
-    wherever it is, and returns to the plan where the multiplier leaves the choice open.
+    wherever it is, and returns to the plan where the multiplier leaves the choice open. That is within some percent;
+    margins on both prices (``compare`` with ``tune``) make means what is demanded.
     """
 
     ahead = 0.1  # a first plan takes longer than the later ones, which start from it
