@@ -9,18 +9,21 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
 import typer
 from some import some
 from test_uncertain_bound import works
 
-from benchmarks import foresight, paper, study, uncertain
+from benchmarks import critics, foresight, paper, study, uncertain
 from benchmarks.document import table_rows, write_sections
 from cirl_marl import MultiAgentVectorEnv, compare, load_network
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.lqr import LinearSystem
 from cirl_marl.controllers.rollout import first_seed, rollout
+from cirl_marl.environments.state import Interval
 from cirl_marl.jobs import run_jobs
+from cirl_marl.network import Floats
 from cirl_marl.optimum import Sampling
 from cirl_marl.optimum.uncertain_bound import UncertainBound
 
@@ -189,3 +192,36 @@ def test_kept_results_name_no_machine() -> None:
     absolute = re.compile(r"""(?<![^\s"',=])/\w[\w.-]*/""")
     assert [path.name for path in kept if absolute.search(path.read_text(encoding="utf-8"))] == []
     assert absolute.search('"/home/somebody/runs"')
+
+
+def test_exact_slopes_are_of_discounted_rewards() -> None:
+    """Slopes that critics are held against are central differences of Σ_k γ^k r_{t+k}, the rewards that agents get."""
+    options: dict[str, Any] = {"reward": "team", "circularity": "mean", "circularity_weight": 0.8}
+    network = load_network("carbo_net").with_options(episode={"horizon": 4})
+    env, rng, discount, step, size = (
+        MultiAgentVectorEnv(network, num_envs=2, **options),
+        np.random.default_rng(2),
+        0.9,
+        1,
+        1e-4,
+    )
+    schedule = [
+        {agent: rng.uniform(-0.6, 0.6, space.shape) * np.ones((2, 1)) for agent, space in env.action_spaces.items()}
+        for _ in range(4)
+    ]
+
+    def play(agent: str, change: float) -> tuple[list[Interval], Floats]:
+        """Return what is played, and the discounted rewards to come in the copies from ``step`` on."""
+        env.reset(seed=3)
+        tape, to_come = [], np.zeros(2)
+        for t, actions in enumerate(schedule):
+            rewards = env.step(actions | {agent: actions[agent] + change * (t == step)})[1]
+            tape.append(env.interval)
+            to_come += discount ** (t - step) * rewards[agent] * (t >= step)
+        return tape, to_come
+
+    slopes = critics.exact_slopes(env, play(env.agents[0], 0.0)[0], discount)
+    for agent in env.agents:
+        difference = (play(agent, size)[1] - play(agent, -size)[1]) / (2.0 * size)
+        exact = slopes[step, env.actuators.entries[agent]].sum(axis=0)
+        np.testing.assert_allclose(exact, difference, atol=1e-6 * np.abs(slopes).max() + 1e-9)
