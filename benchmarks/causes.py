@@ -36,6 +36,8 @@ STEPS = {"independent_ppo": 300_000, ARS: 3_000_000}
 """Environment steps of each run, by recipe: about a minute of processor time."""
 BEFORE = {"n_steps": 40, "batch_size": 640, "gamma": 0.98, "gae_lambda": 0.95, "learning_rate": 1e-3}
 """Parameters of the recipe that the study had before."""
+OFTEN = {"evaluations": 20}
+"""As many as recipes have."""
 console = Console(width=None if sys.stdout.isatty() else 140)
 
 
@@ -99,7 +101,8 @@ VARIANTS = {
     "ppo_noise": Variant(
         "exploration e⁻² instead of e⁻¹ at first", parameters={"policy_kwargs": {"log_std_init": -2.0}}
     ),
-    "ppo_centred": Variant("the mean reward of all copies taken off", learner={"centre_rewards": True}),
+    "ppo_often": Variant("20 evaluations: the price of service moves more often", run=OFTEN),
+    "ppo_centred": Variant("then the mean reward of all copies taken off", run=OFTEN, learner={"centre_rewards": True}),
     "ppo_critic": Variant("critics see the whole state", learner={"policy": "CentralCriticPolicy"}),
     "ppo_order": Variant(
         "arcs learn in the first half only, nodes throughout", match=[{"kind": "arc", "share_of_steps": 0.5}]
