@@ -112,7 +112,8 @@ class Chain:
 
         With ẋ = growth·x, (growth·I − A) x = ``entering``; growth, in 1/``mean``, lies above −μ.
         """
-        return np.asarray(np.linalg.solve(growth * np.eye(self.stages) - self.matrix, self.inflow_shares))
+        stages = np.linalg.solve(growth * np.eye(self.stages) - self.matrix, self.inflow_shares)
+        return np.asarray(np.maximum(stages, 0.0))  # where nothing enters, pivots leave round-off of either sign
 
 
 def _survival_terms(stages: int, rate: float, ages: Floats) -> Floats:
