@@ -217,3 +217,23 @@ def test_nothing_is_said_where_a_source_may_run_dry_or_a_route_be_closed() -> No
     opened = replace(network, arcs=half_open)
     assert rows_of(opened)[1].toarray().any(axis=1).all()
     assert room(opened, np.random.default_rng(0).choice([-1.0, 1.0], (YEARS, 2, 40))).min() >= 0
+
+
+def test_a_valve_a_life_that_agents_shorten_and_what_they_take_are_allowed_for() -> None:
+    """What is asked for passes a valve in part; what is left of a life that may be short is not known."""
+    network = village(40.0)
+    valve = Control(kind=ControlKind.RATE, low=0.0, neutral=1.0, high=1.0)
+    quarry = replace(network.nodes[network.node_index["quarry"]], control=valve)
+    nodes = tuple(quarry if node.id == "quarry" else node for node in network.nodes)
+    gated = replace(network, nodes=nodes, default_agents=("bring", "quarry"))
+    assert not rows_of(gated)[1].toarray().any()
+    shorter = Control(kind=ControlKind.STRETCH, low=0.2, neutral=1.0, high=1.0)
+    use = {"lifetime": Lifetime(mean=LIFE, deviation=2.0, distribution="normal"), "control": shorter}
+    network = replace(village(9.0, use=use), default_agents=("bring", "homes"))
+    np.testing.assert_array_equal(largest_shortages(network), DEMAND)
+    assert room(network, np.random.default_rng(0).choice([-1.0, 1.0], (YEARS, 2, 40))).min() >= 0
+    network = village(9.0)
+    demolition = Arc(id="demolition", donor="homes", recipient="dump", law=Law.CONTROLLED, control=flow(5.0))
+    network = replace(network, arcs=(*network.arcs, demolition), default_agents=("bring", "demolition"))
+    assert largest_shortages(network).max() > starved(9.0).max() + 5.0
+    assert room(network, np.random.default_rng(0).choice([-1.0, 1.0], (YEARS, 2, 40))).min() >= 0

@@ -51,9 +51,9 @@ def shortage_rows(
 ) -> None:
     """Add D − q − L·(u − low)/(high − low), at most 0, of idle arcs that make up for stocks; keys (8, step, arc).
 
-    Nothing is said of valves and capacities that act on such arcs, of contents, of intervals in which a donor may run
-    dry, and of routes through which little of the supply may arrive. The simulator tells in a warning if a service is
-    off by more than NOTABLE of its demand, which is allowed for.
+    Nothing is said of arcs on which a valve acts too, of contents, of intervals in which a donor may run dry, and of
+    routes through which little of the supply may arrive. What the simulator may miss of a demand without a warning,
+    NOTABLE of it, is allowed for.
     """
     network, layout = admissible.network, rows.layout
     if admissible.mixtures is not None:
@@ -85,14 +85,14 @@ def shortage_rows(
 
 
 def _idle_arcs(admissible: Admissible, service: Service) -> Integers:
-    """Return the arcs that supply a service while nobody acts on them; none if a capacity limits one."""
+    """Return the arcs that supply a service while nobody acts on them."""
     network = admissible.network
     arcs = [
         k
         for k, arc in enumerate(network.arcs)
         if arc.makes_up_for == service.id and arc.weight != 0.0 and network.original(arc.id) not in admissible.agents
     ]
-    return np.array([] if any(network.arcs[k].capacity_node for k in arcs) else arcs, dtype=np.intp)
+    return np.array(arcs, dtype=np.intp)
 
 
 def _arrives(
