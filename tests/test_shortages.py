@@ -37,12 +37,12 @@ YEARS, LIFE, DEMAND, START = 12, 8.0, 100.0, 110.0
 SUPPLIED = Family(years=(4, 12), regions=(1, 1), products=(1, 4), lifetimes=(0, 4), supplied=1.0, idle=1.0)
 
 
-def flow(high: float) -> Control:
-    """Return the control of a flow from 0 on."""
-    return Control(kind=ControlKind.FLOW, low=0.0, neutral=0.0, high=high)
+def flow(high: float, low: float = 0.0) -> Control:
+    """Return the control of a flow."""
+    return Control(kind=ControlKind.FLOW, low=low, neutral=low, high=high)
 
 
-def village(high: float = 9.0, ore: float = 1e6, use: dict[str, Any] | None = None) -> Network:
+def village(high: float = 9.0, ore: float = 1e6, use: dict[str, Any] | None = None, low: float = 0.0) -> Network:
     """Return homes that a quarry makes up for; somebody may bring more from a pit."""
     use = {"rate": 1.0 / LIFE} if use is None else use
     nodes = (
@@ -51,7 +51,7 @@ def village(high: float = 9.0, ore: float = 1e6, use: dict[str, Any] | None = No
         Node(id="homes", initial=(START, START), **use),
         Node(id="dump", role=Role.LANDFILL, initial=(0.0, 0.0)),
     )
-    supply: dict[str, Any] = {"law": Law.CONTROLLED, "control": flow(high), "makes_up_for": "living"}
+    supply: dict[str, Any] = {"law": Law.CONTROLLED, "control": flow(high, low), "makes_up_for": "living"}
     arcs = (
         Arc(id="supply", donor="quarry", recipient="homes", **supply),
         Arc(id="bring", donor="pit", recipient="homes", law=Law.CONTROLLED, control=flow(80.0)),
@@ -103,7 +103,7 @@ def largest_shortages(network: Network) -> Floats:
     table = matrix.toarray().reshape(YEARS, YEARS, layout.size)[np.arange(YEARS), np.arange(YEARS)]
     high = network.compartments["supply"].control
     assert high is not None
-    slopes: Floats = -table[:, layout.flow + k].sum(axis=1) * float(high.high)  # type: ignore[arg-type]
+    slopes: Floats = -table[:, layout.flow + k].sum(axis=1) * float(high.high - high.low)  # type: ignore[operator]
     return slopes
 
 
@@ -120,7 +120,7 @@ def starved(high: float) -> Floats:
 @pytest.mark.parametrize("high", [4.0, 11.0, 40.0])
 def test_a_stock_lacks_no_more_than_where_it_is_starved(high: float) -> None:
     """L is what lacks in the simulator if nobody brings anything, and the row is met with what is tolerated."""
-    network = village(high)
+    network = village(high, low=1.0)
     np.testing.assert_allclose(largest_shortages(network), starved(high), atol=1e-6)
     left = room(network, np.full((YEARS, 1, 1), -1.0)).ravel()
     # of what is supplied by need more may be left open
