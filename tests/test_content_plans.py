@@ -408,7 +408,7 @@ def test_levels_of_contents_in_windows_are_those_of_the_simulator() -> None:
 def test_plans_tell_what_contents_are_worth() -> None:
     """Where less ore is all that is wanted, contents beside it weigh what they cost: copper bounds the scrap."""
     network = sorter(low=0.0, high=0.02)
-    solution = improve_plan(bound(network, min_service=1.0))
+    solution = improve_plan(bound(network, min_service=1.0), starts=4)
     run = simulate_plan(solution)
     episode = PlannedEpisode("plan", solution.initial, run.stock, run.flow, run.contents)
     np.testing.assert_allclose(service_levels(network, episode), run.levels[0].T, rtol=1e-12)
@@ -475,7 +475,7 @@ def test_plans_keep_grades(low: float, high: float, costs: tuple[float, float], 
     network = blending(low, high)
     arcs = [replace(arc, accounts={"cost": cost}) for arc, cost in zip(network.arcs[:2], costs, strict=True)]
     solution = bound(replace(network, arcs=(*arcs, network.arcs[2])), aim="cost", min_service=1.0)
-    run = simulate_plan(improve_plan(solution))
+    run = simulate_plan(improve_plan(solution, starts=4))
     assert run.episode_levels.min() >= 1 - 2e-4
     np.testing.assert_allclose(run.flow[:, 0], rich, rtol=2e-3)
     assert run.accounts[0, 0] >= -solution.objective - 1e-9

@@ -148,7 +148,7 @@ PROBLEMS = {
 }
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_plans_solve_pooling_problems(name: str) -> None:
     """The plan makes the known profit, the bound is what envelopes of products allow."""
