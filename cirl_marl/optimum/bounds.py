@@ -92,10 +92,10 @@ class Bound:
             statement = f"λ̄/scale + {self.service_weight:g}·service ≤ {self.objective:.6g}"
         plan = f"λ̄ = {float(self.circularity.mean()):.6g} {mass} and serves {self.service:.4f}"
         subject = f"bound of {self.network.name} over {self.network.episode.horizon} steps"
-        # of supplies that nobody acts on the program knows the bounds alone
+        # of supplies that nobody acts on the program knows bounds, and when stocks may fall short
         agents = self.agents or self.network.agents
         idle = [arc.id for arc in self.network.arcs if arc.makes_up_for and arc.id not in agents]
-        caveat = f"; {', '.join(idle)} may supply any amount within bounds in it" if idle else ""
+        caveat = f"; {', '.join(idle)} may supply more or less in it than in the simulator" if idle else ""
         return f"{subject}: {statement}; its plan promises {plan}{caveat}"
 
     @property
