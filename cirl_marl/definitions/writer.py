@@ -16,7 +16,7 @@ import tomlkit
 from cirl_marl.compartments import kind_of
 from cirl_marl.errors import NetworkError
 from cirl_marl.network import Network, declarations
-from cirl_marl.network.elements import Arc, Compartment, Control, ControlKind, Law, Rate
+from cirl_marl.network.elements import Arc, Compartment, Control, ControlKind, Law, Rate, Service
 from cirl_marl.network.piecewise import PiecewiseRate
 from cirl_marl.network.series import Series, Value
 from cirl_marl.network.uncertainty import CAPACITY, Spread
@@ -123,7 +123,7 @@ class _Writer:
         table: dict[str, Any] = {}
         for name, declaration in declarations.declarations(type(part)).items():
             value, key = getattr(part, name), declaration.key or name
-            must_write = declarations.is_required(type(part), name) or name == _law_field(part)
+            must_write = declarations.is_required(type(part), name) or name == _stated_field(part)
             must_write = must_write or f"{path}.{name}" in {**self._network.uncertain, **self._network.disturbed}
             if not must_write and value == declarations.default_of(type(part), name):
                 continue
@@ -247,8 +247,10 @@ def _spread_keys(spread: Spread | None, value: Value) -> dict[str, Any]:
     return entries
 
 
-def _law_field(part: Any) -> str:
-    """Return the field that the law of an arc needs even where it is as by default."""
+def _stated_field(part: Any) -> str:
+    """Return the field that is written even where it is as by default: of an arc what its law needs."""
+    if isinstance(part, Service):
+        return "low"  # files of 0.1.0 have it, and fingerprints stay the same
     if not isinstance(part, Arc):
         return ""
     by_schedule = part.law is Law.BATCH and not part.by
