@@ -93,6 +93,14 @@ def test_certificates_prove_the_bounds() -> None:
     assert looser[0] - fresh.values[0] == pytest.approx(0.01 * fresh.prices[0], rel=1e-6)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["aluminium_world-v0", "copper_world-v0", "steel_japan-v1"])
+def test_frozen_multipliers_prove_bounds_of_idle_supplies(name: str) -> None:
+    """They are of programs with fewer rows than those of today."""
+    task = load_task(name)
+    assert task.bound().recompute(task.network(), task.seed) == pytest.approx(task.bound().values, rel=1e-9)
+
+
 def test_who_does_nothing_has_no_score() -> None:
     """Nothing moved and nobody served is almost no gap, but service counts; a gap counts from 0 to 1."""
     task = load_task("copper_net-v0")

@@ -83,7 +83,13 @@ class TaskBound:
 
 
 def values_at(network: Network, starts: Floats, certificate: Certificate, demand: Floats) -> Floats:
-    """Return what multipliers prove of episodes from some starts, shape (episodes,), mass."""
-    programs = Programs(Admissible.of(network, None), DEGREE, None)
-    problems = (programs.program(start, demand if len(demand) else None) for start in starts)
+    """Return what multipliers prove of episodes from some starts, shape (episodes,), mass.
+
+    Those that have none for rows of shortages are of programs without them, as tasks of version 1 have them.
+    """
+    admissible, levels = Admissible.of(network, None), demand if len(demand) else None
+    programs = Programs(admissible, DEGREE, None)
+    if len(programs.program(starts[0], levels).under_to) != len(certificate.under):
+        programs = Programs(admissible, DEGREE, None, shortages=False, system=programs.system)
+    problems = (programs.program(start, levels) for start in starts)
     return np.array([verify(problem, certificate, np.zeros(len(problem.cost))).bound for problem in problems])
