@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import optimize
 
 from benchmarks.yearly import Family, yearly_network
 from cirl_marl import (
@@ -30,7 +31,7 @@ from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.matrices import ProgramRows
 from cirl_marl.optimum.options import starting_stocks
 from cirl_marl.optimum.program import Programs, possible_range
-from cirl_marl.optimum.shortages import shortage_rows
+from cirl_marl.optimum.shortages import _least_sum, shortage_rows
 
 Floats = NDArray[np.float64]
 YEARS, LIFE, DEMAND, START = 12, 8.0, 100.0, 110.0
@@ -237,3 +238,22 @@ def test_a_valve_a_life_that_agents_shorten_and_what_they_take_are_allowed_for()
     network = replace(network, arcs=(*network.arcs, demolition), default_agents=("bring", "demolition"))
     assert largest_shortages(network).max() > starved(9.0).max() + 5.0
     assert room(network, np.random.default_rng(0).choice([-1.0, 1.0], (YEARS, 2, 40))).min() >= 0
+
+
+@pytest.mark.parametrize("factor", [0.0, 0.5, 1.0, 1.5, 4.0])
+def test_any_multipliers_prove_a_least_sum(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
+    """Those of a solver that is off prove less; those of its optimum prove it."""
+    rng, solve = np.random.default_rng(0), optimize.linprog
+    cost, rows, most = rng.uniform(0.5, 1, 6), rng.uniform(0, 1, (4, 6)), rng.uniform(90, 99, 6)
+    limits = rng.uniform(5, 10, 4)
+    least = float(solve(cost, A_ub=-rows, b_ub=-limits, bounds=np.stack([0 * most, most], axis=1)).fun)
+
+    def inexact(*arguments: Any, **options: Any) -> Any:
+        solution = solve(*arguments, **options)
+        solution.ineqlin.marginals *= factor
+        return solution
+
+    monkeypatch.setattr("cirl_marl.optimum.shortages.optimize.linprog", inexact)
+    value = _least_sum(cost, rows, limits, most)
+    assert 0.0 <= value <= least + 1e-12
+    assert factor != 1.0 or value == pytest.approx(least)
