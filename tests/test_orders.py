@@ -150,6 +150,7 @@ def test_orders_are_met_or_cut_pro_rata(inflow: float, orders: tuple[float, ...]
 
 
 @given(seed=st.integers(0, 2**31))
+@example(seed=87)
 @example(seed=5)
 @settings(max_examples=8)
 def test_random_networks(seed: int) -> None:
@@ -185,7 +186,7 @@ def test_random_networks(seed: int) -> None:
         for service in network.services[1:]:
             supply, stock = flow[network.arc_index[f"primary_{service.id}"]], after[network.node_index[service.id]]
             low = network.interval_means(service.low)[step]
-            assert ((stock > low * (1 - 1e-9)) | (supply == 30.0)).all()
+            assert ((stock > low * (1 - 1e-9)) | (supply > 30.0 * (1 - 1e-12))).all()
             assert ((stock < low * (1 + 1e-9)) | (supply == 0.0)).all()
 
 
