@@ -41,6 +41,7 @@ from cirl_marl.network.uncertainty import Spread, factor_ranges, network_of_inte
 from cirl_marl.network.validation import content_limits
 from cirl_marl.optimum.options import with_margin
 from cirl_marl.reasons.prices import with_bound
+from cirl_marl.suite.held_out import variant_of
 
 SPREAD = Spread(low=0.5, high=1.2, distribution="uniform")
 
@@ -84,6 +85,21 @@ def test_no_episode_leaves_the_ranges(network: Network, seed: int, is_drawn: boo
             margin = 1e-9 * whole + 1e-14 * stock.sum()
             assert (parts >= low[1:, :, None] * whole - margin).all()
             assert (parts <= high[1:, :, None] * whole + margin).all()
+
+
+@given(seed=st.integers(0, 1000))
+def test_shares_of_components_lead_to_contents_within_the_ranges(seed: int) -> None:
+    """What a node hands on has s_c·x_c of Σ s·x: with three components of certain contents and shares in ranges."""
+    network, rng = sorting_line(), np.random.default_rng(seed)
+    contents, shares = rng.dirichlet(np.ones(3)), rng.uniform(0.01, 1.0, 3)
+    starts = np.tile([[[1.0]], [[0.0]]], (1, 3, len(network.stores)))
+    starts[:, :, 0] = contents
+    bounds = np.ones((2, 3, len(network.arcs)))
+    rejects = network.arc_index["rejects"]
+    bounds[:, :, rejects] = shares * rng.uniform(0.5, 1.0, 3), np.minimum(shares * rng.uniform(1.0, 2.0, 3), 1.0)
+    low, high = reachable_contents(network, starts, bounds)[1][:, :, rejects]
+    exact = contents * shares / (contents @ shares)
+    assert (low <= exact).all() and (exact <= high).all()
 
 
 @pytest.mark.parametrize(("controlled", "transfer"), [(False, 0.8), (True, 0.9)])
@@ -211,7 +227,9 @@ def test_what_is_derived_is_not_checked_again() -> None:
     assert with_margin(network, 1.1).services[-1].high == pytest.approx(least / 1.1)
     run = simulate_plan(bound(with_margin(network, 1.1), degree=1))
     assert run.episode_levels[0, 0] == pytest.approx(1 / 1.1, rel=1e-9)
-    assert with_bound(sorting_line(controlled=True), "rejects", 1, np.array([0.5])).is_variant
+    controlled = with_limit(sorting_line(controlled=True), 0.01)
+    assert not controlled.is_variant and with_bound(controlled, "rejects", 1, np.array([0.5])).is_variant
+    assert variant_of(controlled, 1).is_variant
     late = with_limit(mine(copper=Series(times=(0.0, 3.0), values=(0.2, 0.1))), 0.03)
     assert network_of_intervals(late, np.array([0, 1])).services == late.services
 
