@@ -457,6 +457,7 @@ OTHER = Arc(id="other", donor="use", recipient="dump", rate=0.1)
         ({"node": {"rate": 0.1}}, (), r"so that there is no rate"),
         ({"node": {"control": Control(kind=ControlKind.RATE, low=0, neutral=1, high=1)}}, (), r"controlled by kind"),
         ({"node": {"control": Control(kind=ControlKind.STRETCH, low=0, neutral=1, high=2)}}, (), r"stretch is above"),
+        ({"node": {"control": Control(kind=ControlKind.STRETCH, low=1e-320, neutral=1, high=2)}}, (), r"must be 0, or"),
         ({"node": {"history": ENDED}}, (), r"series ends at -2, bef"),
         ({"node": {"history": LATE}}, (), r"series begins at 1, not"),
         ({"node": {"history": Series(times=(-5.0,), values=(0.0,))}}, (), r"history: nothing is left of it"),

@@ -9,7 +9,7 @@ import numpy as np
 
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network.compartment_model import CompartmentModel, OutflowModel, ReleasingModel, Vehicle
-from cirl_marl.network.declarations import LARGEST, bound_problems, default_of
+from cirl_marl.network.declarations import LARGEST, SMALLEST, bound_problems, default_of
 from cirl_marl.network.elements import (
     LAW_FIELDS,
     MAX_STEPS,
@@ -195,8 +195,9 @@ def _control_problems(
     low, neutral, high = (
         np.array(network.interval_means(bound)) for bound in (control.low, control.neutral, control.high)
     )
-    if not (np.abs([low, neutral, high]) <= LARGEST).all():
-        yield f"{subject}: control bounds must be finite, and at most {LARGEST:g} in size"
+    sizes = np.abs([low, neutral, high])
+    if not ((sizes == 0) | (sizes >= SMALLEST) & (sizes <= LARGEST)).all():
+        yield f"{subject}: control bounds must be 0, or between {SMALLEST:g} and {LARGEST:g} in size"
     elif not ((low <= neutral) & (neutral <= high)).all() or control.low == control.high:
         worst = int(np.argmax((low > neutral) | (neutral > high)))
         bounds = f"{low[worst]:g}, {neutral[worst]:g}, {high[worst]:g}{unit}"
