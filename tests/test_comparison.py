@@ -31,7 +31,7 @@ from cirl_marl.learners.trainer import Progress, Training
 from cirl_marl.network import Network
 from cirl_marl.optimum import search_each
 from cirl_marl.records.files import publish_folder
-from cirl_marl.report.tradeoffs import COMPARISON_FILES, write_comparison
+from cirl_marl.report.tradeoffs import write_comparison
 
 pytestmark = pytest.mark.medium
 
@@ -131,10 +131,9 @@ def test_evaluation_and_sweep_tell_how_far_they_are(bottles: Network, runs: list
 def test_files_are_whole_and_say_where_they_come_from(runs: list[Path], tmp_path: Path) -> None:
     """Every episode of every policy is a row; the provenance holds hashes of all that was read."""
     found = compare(runs, ["neutral"], episodes=3)
-    assert write_comparison(found, tmp_path / "out", episodes=3) == [
-        tmp_path / "out" / name for name in COMPARISON_FILES
-    ]
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(COMPARISON_FILES)
+    paths = write_comparison(found, tmp_path / "out", episodes=3)
+    assert [path.name for path in paths] == ["episodes.csv", "summary.csv", "summary.json", "comparison.png"]
+    assert sorted(paths) == sorted((tmp_path / "out").iterdir())
     with (tmp_path / "out" / "episodes.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 4 * 3

@@ -17,7 +17,6 @@ from cirl_marl import Arc, CirlError, Control, ControlKind, Episode, Network, No
 from cirl_marl.cli import app
 from cirl_marl.evaluation.levers import SETTLED, SHORT, LeverRow, _agents_by_lever
 from cirl_marl.optimum.bounds import Bound, bound
-from cirl_marl.report.lever_chart import LEVER_FILES
 
 STOCKS, RATES, STEPS = {"glass": 40.0, "paper": 100.0, "metal": 10.0}, {"glass": 0.1, "paper": 0.2, "metal": 0.3}, 4
 HALF = Control(kind=ControlKind.RATE, low=0.5, neutral=1.0, high=1.0)
@@ -123,14 +122,14 @@ def test_command(tmp_path: Path) -> None:
     arguments = ["levers", str(path), "--out", str(tmp_path / "out"), "--group", "dry=paper_lost, metal_lost"]
     outcome = CliRunner().invoke(app, arguments)
     assert outcome.exit_code == 0 and "all so far" in outcome.output
-    with (tmp_path / "out" / LEVER_FILES[0]).open(newline="") as file:
+    with (tmp_path / "out" / "levers.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["agents"] for row in rows] == ["paper_lost metal_lost", "glass_lost"]
     mass = load_network(path).mass_unit
     assert float(rows[0][f"alone: change ({mass})"]) == pytest.approx(saved("paper") + saved("metal"), rel=1e-6)
-    about = json.loads((tmp_path / "out" / LEVER_FILES[1]).read_text())
+    about = json.loads((tmp_path / "out" / "levers.json").read_text())
     assert about["all levers"] - about["as usual"] == pytest.approx(sum(map(saved, STOCKS)), rel=1e-6)
-    assert (tmp_path / "out" / LEVER_FILES[2]).stat().st_size > 10_000
+    assert (tmp_path / "out" / "levers.png").stat().st_size > 10_000
     outcome = CliRunner().invoke(app, ["levers", str(path), "--group", "paper_lost"])
     assert "needs a name and agents, as in scrap=old_scrap,new_scrap" in str(outcome.exception)
 

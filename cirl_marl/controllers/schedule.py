@@ -16,7 +16,7 @@ from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.calendar import labels
 from cirl_marl.network.elements import ControlKind, Law
-from cirl_marl.records.files import write_atomically, write_table
+from cirl_marl.records.files import write_table
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class Schedule:
         texts = [[f"{value:.10g}" for value in column] for column in self.columns]
         header = (*self.header[:2], *(f"{label} at the start" for label in calendar), *self.header[2:])
         rows = zip(*texts[:2], *dates, *texts[2:], strict=True)
-        write_atomically(path, lambda partial: write_table(partial, header, list(rows)))
+        write_table(path, header, rows)
 
 
 def schedule(

@@ -21,7 +21,7 @@ from cirl_marl.network import Network
 from cirl_marl.network.calendar import labels
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.registry import SETTABLE, named_controller
-from cirl_marl.records.files import write_atomically, write_table
+from cirl_marl.records.files import write_table
 
 
 @positional_record
@@ -83,10 +83,7 @@ class Simulation:
 
     def write(self, path: str | Path) -> Path:
         """Write ``table`` to a CSV file, whole or not at all, and return its path; missing folders are made."""
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, lambda partial: write_table(partial, *self.table()))
-        return path
+        return write_table(Path(path), *self.table())
 
 
 def disturbance_columns(network: Network) -> list[str]:

@@ -7,9 +7,10 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from cirl_marl.errors import RunError
@@ -109,9 +110,38 @@ def publish_folder(folder: Path) -> Iterator[Path]:
             folder.rmdir()
 
 
-def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Write a CSV file; None becomes an empty cell."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header)
-        writer.writerows(["" if cell is None else cell for cell in row] for row in rows)
+Rows = Iterable[Sequence[object]]
+
+
+def publish_result(
+    folder: Path,
+    tables: Mapping[str, tuple[Sequence[str], Rows]],
+    pictures: Mapping[str, Callable[[Path], object]],
+    records: Mapping[str, object] = MappingProxyType({}),
+) -> list[Path]:
+    """Write the files of a result by name, all of them or none, and return their paths.
+
+    They are CSV files of header and rows, then JSON files of ``records``, then what ``pictures`` draw.
+    """
+    with publish_folder(folder) as draft:
+        for name, table in tables.items():
+            write_table(draft / name, *table)
+        for name, record in records.items():
+            write_json(draft / name, record)
+        for name, draw in pictures.items():
+            draw(draft / name)
+    return [folder / name for name in (*tables, *records, *pictures)]
+
+
+def write_table(path: Path, header: Sequence[str], rows: Rows) -> Path:
+    """Write a CSV file atomically and return its path; None becomes an empty cell, and missing folders are made."""
+
+    def write(temporary: Path) -> None:
+        with temporary.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(header)
+            writer.writerows(["" if cell is None else cell for cell in row] for row in rows)
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, write)
+    return path

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.network import Floats
 from cirl_marl.network.calendar import in_years, years
 from cirl_marl.network.elements import CIRCULARITY
-from cirl_marl.records.files import publish_folder, write_atomically, write_json, write_table
+from cirl_marl.records.files import publish_result, write_table
 from cirl_marl.report.terminal import text_table
 
 SHOWN = len(SERIES)
@@ -27,9 +28,8 @@ SHOWN = len(SERIES)
 
 def write_accounts(folder: Path, name: str, simulation: Simulation, title: str) -> list[Path]:
     """Write ``name_accounts.csv`` and ``name_accounts.png`` of a simulated episode; return their paths."""
-    table, picture = folder / f"{name}_accounts.csv", folder / f"{name}_accounts.png"
-    write_atomically(table, lambda draft: write_table(draft, *accounts_table(simulation)))
-    return [table, save_accounts(picture, simulation, title=title)]
+    table = write_table(folder / f"{name}_accounts.csv", *accounts_table(simulation))
+    return [table, save_accounts(folder / f"{name}_accounts.png", simulation, title=title)]
 
 
 def accounts_table(simulation: Simulation) -> tuple[list[str], list[list[object]]]:
@@ -132,12 +132,8 @@ def write_account_front(front: AccountFront, folder: Path, **options: Any) -> li
     bounds, plans = front.volumes
     about: dict[str, Any] = {"provenance": provenance(front.network, **options), "columns": header, "points": rows}
     about |= {"as_usual": front.as_usual.tolist(), "hypervolume": {"proved": bounds, "plans": plans}}
-    names = ("pareto.csv", "pareto.json", "pareto.png")
-    with publish_folder(folder) as draft:
-        write_table(draft / names[0], header, rows)
-        write_json(draft / names[1], about)
-        save_account_front(draft / names[2], front)
-    return [folder / name for name in names]
+    picture = partial(save_account_front, front=front)
+    return publish_result(folder, {"pareto.csv": (header, rows)}, {"pareto.png": picture}, {"pareto.json": about})
 
 
 def save_account_front(path: str | Path, front: AccountFront, *, title: str = "") -> Path:

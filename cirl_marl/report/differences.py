@@ -18,7 +18,7 @@ from cirl_marl.evaluation.compared_quantities import ComparedQuantity, rank_quan
 from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.evaluation.statistics import finite_or_none
 from cirl_marl.network import Floats
-from cirl_marl.records.files import publish_folder, write_table
+from cirl_marl.records.files import publish_result
 from cirl_marl.report.panels import LEVELS, PANELS, Panel, save_panels
 from cirl_marl.report.terminal import text_table
 
@@ -60,12 +60,10 @@ def write_alternatives(
     header = ["quantity", "unit", first.name]
     for simulation in alternatives:
         header += [form.format(simulation.name) for form in ("{}", "difference of {}", "relative difference of {}")]
-    with publish_folder(folder) as draft:
-        for stem, simulation in files.items():
-            write_table(draft / f"{stem}.csv", *simulation.table())
-        write_table(draft / f"{name}.csv", header, map(_row, quantities))
-        save_alternatives(draft / f"{name}.png", [first, *alternatives], quantities, title=title)
-    return [folder / file for file in (*(f"{stem}.csv" for stem in files), f"{name}.csv", f"{name}.png")]
+    tables = {f"{stem}.csv": simulation.table() for stem, simulation in files.items()}
+    tables[f"{name}.csv"] = header, [*map(_row, quantities)]
+    draw = partial(save_alternatives, simulations=[first, *alternatives], quantities=quantities, title=title)
+    return publish_result(folder, tables, {f"{name}.png": draw})
 
 
 def _row(quantity: ComparedQuantity) -> list[object]:

@@ -27,7 +27,7 @@ from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.calendar import elapsed_time, in_years, year
 from cirl_marl.network.declarations import positional_record
-from cirl_marl.records.files import read_content, write_atomically, write_table
+from cirl_marl.records.files import read_content, write_table
 from cirl_marl.records.machine import versions
 
 WORLD = "World"
@@ -43,15 +43,13 @@ def write_iamc(path: str | Path, simulations: Sequence[Simulation]) -> Path:
     Raises:
         CirlError: what ``iamc_years`` raises.
     """
-    path, years = Path(path), iamc_years([(simulation.network, simulation.control) for simulation in simulations])
+    years = iamc_years([(simulation.network, simulation.control) for simulation in simulations])
     rows = [
         [*names, *values(simulation.rollout).tolist()]
         for simulation in simulations
         for names, values in _series(simulation.network, simulation.control)
     ]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, lambda draft: write_table(draft, [*NAMES, *map(str, years)], rows))
-    return path
+    return write_table(Path(path), [*NAMES, *map(str, years)], rows)
 
 
 def iamc_years(episodes: Sequence[tuple[Network, str]]) -> range:

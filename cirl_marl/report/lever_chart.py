@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,9 @@ from rich.table import Table
 from cirl_marl.drawing.style import FAINT, INK, NEUTRAL, SERIES, WARNING, WIDTH, draw_steps, number, save, style_axes
 from cirl_marl.evaluation.figures import provenance
 from cirl_marl.evaluation.levers import Levers, Trial
-from cirl_marl.records.files import publish_folder, write_json, write_table
+from cirl_marl.records.files import publish_result
 from cirl_marl.report.terminal import text_table
 
-LEVER_FILES = ("levers.csv", "levers.json", "levers.png")
 CASES = ("alone", "with those above", "without it")
 
 
@@ -52,12 +52,9 @@ def write_levers(levers: Levers, folder: Path, **options: Any) -> list[Path]:
     about: dict[str, Any] = {"provenance": provenance(levers.network, **options), "unit": mass}
     about |= {"as usual": levers.usual.circularity, "all levers": levers.together.circularity}
     about["bound"] = levers.plan.objective
-    with publish_folder(folder) as draft:
-        files = [draft / name for name in LEVER_FILES]
-        write_table(files[0], header, rows)
-        write_json(files[1], about | {"columns": header, "rows": rows})
-        save_levers(files[2], levers)
-    return [folder / name for name in LEVER_FILES]
+    about |= {"columns": header, "rows": rows}
+    picture = partial(save_levers, levers=levers)
+    return publish_result(folder, {"levers.csv": (header, rows)}, {"levers.png": picture}, {"levers.json": about})
 
 
 def _rows(levers: Levers) -> Iterator[list[object]]:

@@ -11,7 +11,7 @@ from rich.table import Table
 from cirl_marl.drawing.style import number
 from cirl_marl.reasons.inverse import ObjectiveWeights
 from cirl_marl.reasons.sentences import joined_text
-from cirl_marl.records.files import write_atomically, write_table
+from cirl_marl.records.files import write_table
 from cirl_marl.report.terminal import text_table
 
 
@@ -68,9 +68,7 @@ def write_weights(weights: ObjectiveWeights, path: Path) -> Path:
     header += ["share under which plans are best", "distance from the best"]
     distance = f"{weights.distance:.10g}"
     rows = [[*row, f"{best:.10g}", distance] for row, best in zip(_rows(weights), weights.best, strict=True)]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, lambda draft: write_table(draft, header, rows))
-    return path
+    return write_table(path, header, rows)
 
 
 def _rows(weights: ObjectiveWeights) -> list[tuple[Any, ...]]:

@@ -17,7 +17,7 @@ from cirl_marl.evaluation.sampling import SampledEpisodes, Sensitivity
 from cirl_marl.evaluation.simulations import disturbance_columns
 from cirl_marl.evaluation.statistics import finite_or_none
 from cirl_marl.network import Floats
-from cirl_marl.records.files import publish_folder, write_table
+from cirl_marl.records.files import publish_result
 from cirl_marl.report.panels import LEVELS, PANELS, Panel, save_panels
 from cirl_marl.report.terminal import text_table
 from cirl_marl.report.trajectory import time_columns
@@ -62,14 +62,11 @@ def write_samples(
     for quantity, unit, values in _quantities(samples):
         bands = np.array([values.mean(axis=0), *np.quantile(values, QUANTILES, axis=0)]).T.tolist()
         rows += [[*time, quantity, unit, *band] for time, band in zip(clock, bands, strict=True)]
-    tables = {"bands": (header, rows), "draws": _draws(samples)}
+    tables = {f"{name}_bands.csv": (header, rows), f"{name}_draws.csv": _draws(samples)}
     if causes:
-        tables["causes"] = _causes(samples, causes)
-    with publish_folder(folder) as draft:
-        for kind, table in tables.items():
-            write_table(draft / f"{name}_{kind}.csv", *table)
-        save_bands(draft / f"{name}_bands.png", samples, title=title)
-    return [folder / file for file in (*(f"{name}_{kind}.csv" for kind in tables), f"{name}_bands.png")]
+        tables[f"{name}_causes.csv"] = _causes(samples, causes)
+    draw = partial(save_bands, samples=samples, title=title)
+    return publish_result(folder, tables, {f"{name}_bands.png": draw})
 
 
 def _draws(samples: SampledEpisodes) -> tuple[list[str], list[list[object]]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,10 @@ from cirl_marl.evaluation.episode_count import EPISODES_DISTURBED, MOST_EPISODES
 from cirl_marl.evaluation.figures import provenance
 from cirl_marl.evaluation.pareto import ParetoFront
 from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, Aggregate, finite_or_none, interquartile_mean
-from cirl_marl.records.files import publish_folder, write_json, write_table
+from cirl_marl.records.files import publish_result
 from cirl_marl.report.curves import PointSeries, save_fronts
 from cirl_marl.report.terminal import text_table
 
-COMPARISON_FILES = ("episodes.csv", "summary.csv", "summary.json", "comparison.png")
-PARETO_FILES = ("pareto.csv", "pareto.json", "pareto.png")
 FORMS = {
     "circularity": "{:.4g}",
     "gain": "{:+.1%}",
@@ -146,13 +145,12 @@ def write_comparison(comparison: Comparison, folder: Path, **options: Any) -> li
     units = _headers(comparison)
     episodes = ["name", "training seed", "run", "episode", *units, "start seed"]
     summary = ["name", "training seeds", *(f"{name}{end}" for name in units for end in ("", ", low", ", high"))]
-    with publish_folder(folder) as draft:
-        files = [draft / name for name in COMPARISON_FILES]
-        write_table(files[0], episodes, _episode_rows(comparison))
-        write_table(files[1], summary, _summary_rows(comparison))
-        write_json(files[2], summary_of(comparison, **options))
-        save_comparison(files[3], comparison)
-    return [folder / name for name in COMPARISON_FILES]
+    tables = {
+        "episodes.csv": (episodes, _episode_rows(comparison)),
+        "summary.csv": (summary, _summary_rows(comparison)),
+    }
+    picture, record = partial(save_comparison, comparison=comparison), summary_of(comparison, **options)
+    return publish_result(folder, tables, {"comparison.png": picture}, {"summary.json": record})
 
 
 def summary_of(comparison: Comparison, **options: Any) -> dict[str, Any]:
@@ -235,13 +233,11 @@ def write_front(front: ParetoFront, folder: Path, **options: Any) -> list[Path]:
     mass = front.network.mass_unit
     header = ["kind", "least service level", f"circularity ({mass})", "circularity weight", "training seed"]
     points = [[point.kind, point.service, point.circularity, point.weight, point.seed] for point in front.points]
-    about = {"provenance": provenance(front.network, front.runs, **options), "no_bound": front.reason or None}
-    with publish_folder(folder) as draft:
-        files = [draft / name for name in PARETO_FILES]
-        write_table(files[0], header, points)
-        write_json(files[1], about | {"columns": header, "points": points})
-        save_pareto(files[2], front)
-    return [folder / name for name in PARETO_FILES]
+    about: dict[str, Any] = {"provenance": provenance(front.network, front.runs, **options)}
+    about["no_bound"] = front.reason or None
+    about |= {"columns": header, "points": points}
+    picture = partial(save_pareto, front=front)
+    return publish_result(folder, {"pareto.csv": (header, points)}, {"pareto.png": picture}, {"pareto.json": about})
 
 
 def save_pareto(path: str | Path, front: ParetoFront, *, title: str = "") -> Path:

@@ -15,7 +15,7 @@ from cirl_marl.drawing.style import SERIES, WIDTH, readable, save, style_axes
 from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.calendar import labels
-from cirl_marl.records.files import write_atomically, write_table
+from cirl_marl.records.files import write_table
 from cirl_marl.report.account_tables import write_accounts
 from cirl_marl.report.curves import save_trajectory
 
@@ -35,9 +35,8 @@ def write_trajectory(folder: Path, name: str, simulation: Simulation, title: str
     if network.accounts:
         files += write_accounts(folder, name, simulation, title)
     if of_ages := pyramids(network, simulation.rollout, simulation.rollout.start):
-        ages, bars = folder / f"{name}_ages.csv", folder / f"{name}_ages.png"
-        write_atomically(ages, lambda draft: write_table(draft, *ages_table(network, of_ages)))
-        files += [ages, save_pyramids(bars, network, of_ages, title=title)]
+        files.append(write_table(folder / f"{name}_ages.csv", *ages_table(network, of_ages)))
+        files.append(save_pyramids(folder / f"{name}_ages.png", network, of_ages, title=title))
     return files
 
 

@@ -13,7 +13,7 @@ from filelock import FileLock
 
 from cirl_marl.errors import CirlError, RunError, unknown_name
 from cirl_marl.network.declarations import KeptRecord, frozen_record
-from cirl_marl.records.files import write_atomically, write_table
+from cirl_marl.records.files import write_table
 from cirl_marl.suite.tasks import CONTROLLERS, PACKAGE_DATA, BenchmarkTask, Figures, load_task, tasks
 from cirl_marl.suite.weights import controller_of, sha256_of
 
@@ -132,9 +132,7 @@ def add_rows(path: Path, more: Sequence[ResultRow]) -> None:
     with FileLock(path.with_name(f".{path.name}.lock")):
         rows = {key_of(row): row for row in [*(read_rows(path) if path.is_file() else []), *more]}
         order = sorted(rows.values(), key=_order)
-        write_atomically(
-            path, lambda place: write_table(place, [f.name for f in fields(ResultRow)], map(_cells, order))
-        )
+        write_table(path, [field.name for field in fields(ResultRow)], map(_cells, order))
 
 
 def _order(row: ResultRow) -> tuple[Any, ...]:

@@ -22,7 +22,7 @@ from filelock import FileLock
 
 from cirl_marl.errors import RunError
 from cirl_marl.jobs.work import JobFiles
-from cirl_marl.records.files import read_record, refuse_links, write_atomically, write_json, write_table
+from cirl_marl.records.files import read_record, refuse_links, write_json, write_table
 from cirl_marl.sweeps.cells import Cell
 from cirl_marl.sweeps.reading import SweepFile, SweepOptions
 
@@ -89,8 +89,7 @@ class SweepFolder:
     def write_table(self) -> list[dict[str, Any]]:
         """Write the table of results, and return its rows."""
         rows = self.rows()
-        cells = [[row[key] for key in rows[0]] for row in rows]
-        write_atomically(self.table, lambda partial: write_table(partial, list(rows[0]), cells))
+        write_table(self.table, list(rows[0]), ([row[key] for key in rows[0]] for row in rows))
         return rows
 
     def row(self, name: str) -> dict[str, Any]:
