@@ -276,5 +276,5 @@ def test_gaps_and_rows(tmp_path: Path) -> None:
     command = ["fit", str(table), "--column", "x", "--times", "day", "--where"]
     shown = CliRunner().invoke(app, [*command, "place=b"])
     assert shown.exit_code == 0 and "--where place=b --times day; 30 rows, 0 to 29" in shown.stdout
-    with pytest.raises(CirlError, match="--where b: write COLUMN=TEXT"):
+    with pytest.raises(CirlError, match="--where b: needs COLUMN=TEXT"):
         CliRunner().invoke(app, [*command, "b"], catch_exceptions=False)

@@ -132,6 +132,10 @@ def test_command(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "levers.png").stat().st_size > 10_000
     outcome = CliRunner().invoke(app, ["levers", str(path), "--group", "paper_lost"])
     assert "needs a name and agents, as in scrap=old_scrap,new_scrap" in str(outcome.exception)
+    twice = ["a=paper_lost", "a=glass_lost"]
+    for groups, fault in ((["dry="], "needs a name and agents"), (twice, "'a' is given twice")):
+        outcome = CliRunner().invoke(app, ["levers", str(path), *(f"--group={group}" for group in groups)])
+        assert fault in str(outcome.exception)
 
 
 def test_late_levers_share_a_row(tmp_path: Path) -> None:

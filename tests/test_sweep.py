@@ -135,7 +135,7 @@ def test_a_place_that_cannot_be_is_refused_before_anything_is_written(
             ("--slurm", "slurm_partition=long"),
             "--slurm slurm_partition=long: goes with --on slurm, not with --on local",
         ),
-        (("--on", "slurm", "--slurm", "long"), "--slurm long: must be NAME=VALUE"),
+        (("--on", "slurm", "--slurm", "long"), "--slurm long: needs NAME=VALUE"),
     ):
         assert command(monkeypatch, "sweep", str(asked), *arguments) == 2
         assert said in capsys.readouterr().err

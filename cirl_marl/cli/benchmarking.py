@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from cirl_marl.cli import common
 from cirl_marl.jobs import PLACES
-
-if TYPE_CHECKING:
-    from cirl_marl.suite.result_rows import ResultRow
 
 benchmark = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
 common.app.add_typer(
@@ -70,10 +66,7 @@ def run(
         variant = f", variant {row.variant}" if row.variant else ""
         common.say(f"{row.id}{variant}: λ̄ {row.circularity:.5g}, service {row.service:.4f}, gap {row.gap:.2%}")
     common.say(f"{len(outcome.rows)} rows in {folder / 'results.csv'}")
-    for failure in outcome.failures:
-        common.errors.print(f"failed: {failure}", soft_wrap=True, highlight=False, markup=False)
-    if outcome.failures:
-        raise typer.Exit(1)
+    common.end_with(outcome.failures)
 
 
 @benchmark.command()
@@ -83,8 +76,10 @@ def table(
 ) -> None:
     """Show gaps by task, scores over all tasks with bootstrap intervals, who is better than whom, and transfer."""
     from cirl_marl.report.benchmark_tables import benchmark_tables, save_profiles
+    from cirl_marl.suite.result_rows import KEPT_RESULTS, key_of, read_rows
 
-    rows = _rows(results)
+    # of the same row in several tables the last counts
+    rows = [*{key_of(row): row for path in results or [KEPT_RESULTS] for row in read_rows(path)}.values()]
     for part in benchmark_tables(rows):
         common.console.print(part)
     if out is not None:
@@ -104,10 +99,3 @@ def verify(
     for path in results or [KEPT_RESULTS]:
         for name in verified(path, row or (), variants=held_out):
             common.say(f"as stated: {name}")
-
-
-def _rows(results: Sequence[Path] | None) -> list[ResultRow]:
-    """Return the rows of several tables; of the same row the last counts."""
-    from cirl_marl.suite.result_rows import KEPT_RESULTS, key_of, read_rows
-
-    return [*{key_of(row): row for path in results or [KEPT_RESULTS] for row in read_rows(path)}.values()]

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 from rich.console import Console
@@ -36,6 +36,7 @@ REWARDS = "local, circularity, mixed, difference, mixed_difference, local_sum, t
 LINE_SECONDS = 30.0
 """Between two lines of progress without a terminal."""
 OBSERVE = "local, neighbours, full, stocks, model"
+Value = TypeVar("Value")
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -104,22 +105,49 @@ Html = Annotated[
 ]
 
 
-def numbers_by_name(entries: Sequence[str] | None, option: str, form: str) -> dict[str, float]:
-    """Read NAME=NUMBER of each entry of a repeatable option.
+def values_by_name(
+    entries: Sequence[str] | None, option: str, form: str, read: Callable[[str], Value]
+) -> dict[str, Value]:
+    """Read NAME=VALUE of each entry of a repeatable option; ``read`` raises a ``ValueError`` for what is no value.
 
     Raises:
         CirlError: naming the option, the entry, and the ``form`` that it needs.
     """
-    numbers = {}
+    values: dict[str, Value] = {}
     for entry in entries or ():
-        name, _, number = entry.partition("=")
-        if name in numbers:
+        name, equals, text = (part.strip() for part in entry.partition("="))
+        if name in values:
             raise CirlError(f"{option} {entry}: '{name}' is given twice")
         try:
-            numbers[name] = float(number)
+            values[name] = read(text)
         except ValueError:
-            raise CirlError(f"{option} {entry}: needs {form}") from None
-    return numbers
+            equals = ""
+        if not name or not equals:
+            raise CirlError(f"{option} {entry}: needs {form}")
+    return values
+
+
+def budgets(entries: Sequence[str] | None) -> dict[str, float]:
+    """Return what ``--at-most`` asks for, by account."""
+    return values_by_name(entries, "--at-most", "ACCOUNT=TOTAL with a number", float)
+
+
+@contextmanager
+def stoppable(place: str) -> Iterator[None]:
+    """Say after Ctrl-C what is kept, and end with code 130; ``place`` says what of it is where."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        say(f"\nstopped; {place}. The same command goes on.")
+        raise typer.Exit(130) from None
+
+
+def end_with(failures: Sequence[object]) -> None:
+    """Say what failed, and end with code 1 if anything did."""
+    for failure in failures:
+        errors.print(f"failed: {failure}", soft_wrap=True, highlight=False, markup=False)
+    if failures:
+        raise typer.Exit(1)
 
 
 def plain(error: BaseException) -> str:

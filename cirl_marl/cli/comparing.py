@@ -72,7 +72,7 @@ def compare(
         check_tuning(tune, min_service)
     folder, page = None if out is None else common.folder_for(out, "--out"), common.page_for(html)
     options: dict[str, Any] = {"seed": seed, "min_service": min_service, "uncertain": uncertain}
-    options["at_most"] = budgets = common.numbers_by_name(at_most, "--at-most", "ACCOUNT=TOTAL with a number")
+    options["at_most"] = budgets = common.budgets(at_most)
     options |= {"tune": tune, "futures": futures, "bounds": bounds and bound_draws is None}
     expected = None
     if bound_draws is None and (on, workers) != ("here", None):
@@ -169,13 +169,9 @@ def pareto(
     if min_service is not None:
         raise CirlError("--min-service goes with --between; without it service is one of the aims")
     options: dict[str, Any] = {"points": points or 5, "seeds": seeds, "steps": steps, "episodes": episodes}
-    try:
-        with common.shares() as progress:
-            place: dict[str, Any] = {"directory": folder, "on": on, "workers": workers}
-            front = swept(network, recipe, scenario=scenario, progress=progress, **place, **options)
-    except KeyboardInterrupt:
-        common.say(f"\nstopped; finished trainings are kept in {folder}. The same command goes on.")
-        raise typer.Exit(130) from None
+    with common.stoppable(f"finished trainings are kept in {folder}"), common.shares() as progress:
+        place: dict[str, Any] = {"directory": folder, "on": on, "workers": workers}
+        front = swept(network, recipe, scenario=scenario, progress=progress, **place, **options)
     for kind in ("bound", "plan", "trained", "neutral"):
         for point in front.of(kind):
             about = "" if point.weight is None else f"  (weight {point.weight:.3g}, seed {point.seed})"
@@ -236,7 +232,7 @@ def levers(
     from cirl_marl.evaluation.levers import levers as levers_of
     from cirl_marl.report.lever_chart import levers_table, write_levers
 
-    groups = dict(_group(text) for text in group or ())
+    groups = common.values_by_name(group, "--group", "a name and agents, as in scrap=old_scrap,new_scrap", _members)
     variant = load_network(network, scenario=scenario)
     folder = common.folder_for(out or Path("runs") / f"levers-{common.stem(variant)}", "--out")
     options: dict[str, Any] = {"groups": groups, "min_service": min_service, "bounds": bounds, "most": most}
@@ -247,10 +243,7 @@ def levers(
         common.say(f"wrote {path}")
 
 
-def _group(text: str) -> tuple[str, list[str]]:
-    """Return name and agents of a lever, as ``--group`` gives them."""
-    name, is_given, agents = text.partition("=")
-    members = common.comma_separated(agents)
-    if not is_given or not name.strip() or not members:
-        raise CirlError(f"--group {text}: needs a name and agents, as in scrap=old_scrap,new_scrap")
-    return name.strip(), members
+def _members(text: str) -> list[str]:
+    if not (members := common.comma_separated(text)):
+        raise ValueError("a lever needs agents")
+    return members

@@ -225,10 +225,7 @@ def plan(
         raise CirlError(f"--out {out}: needs the name of a .csv file")
     page = common.page_for(html)
     options: dict[str, Any] = {"scenario": scenario, "min_service": min_service, "seed": seed, "smooth": smooth}
-    options |= {
-        "aim": _aim(aim),
-        "at_most": common.numbers_by_name(at_most, "--at-most", "ACCOUNT=TOTAL with a number"),
-    }
+    options |= {"aim": _aim(aim), "at_most": common.budgets(at_most)}
     with common.bar("planning") as progress:
         schedule = plans.plan(source, control, **options, progress=progress)
     network = schedule.network
@@ -249,7 +246,8 @@ def plan(
 def _aim(entries: list[str] | None) -> str | dict[str, float]:
     if entries and len(entries) == 1 and "=" not in entries[0]:
         return entries[0]
-    return common.numbers_by_name(entries, "--aim", "a single NAME, or NAME=WEIGHT with a number") or "circularity"
+    form = "a single NAME, or NAME=WEIGHT with a number"
+    return common.values_by_name(entries, "--aim", form, float) or "circularity"
 
 
 def _say_lines(text: str, prefix: str = "") -> None:
@@ -262,4 +260,4 @@ def _constants(controls: Sequence[str], settings: list[str]) -> dict[str, float]
 
     if settings and not set(controls) & set(SETTABLE):
         raise CirlError(f"--set goes with --control constant or scripted, not with {', '.join(controls)}")
-    return common.numbers_by_name(settings, "--set", "AGENT=VALUE with a number in [-1, 1]")
+    return common.values_by_name(settings, "--set", "AGENT=VALUE with a number in [-1, 1]", float)

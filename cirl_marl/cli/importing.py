@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cirl_marl.cli.common import NETWORKS, app, bar, errors, say
-from cirl_marl.errors import CirlError
+from cirl_marl.cli.common import NETWORKS, app, bar, errors, say, values_by_name
 
 if TYPE_CHECKING:
     from cirl_marl.importing.balances import Reconciliation
@@ -147,9 +146,7 @@ def fit(
     """
     from cirl_marl.importing.disturbance_fits import fit_disturbances
 
-    conditions = dict(condition.partition("=")[::2] for condition in rows or ())
-    if unclear := [condition for condition in rows or () if "=" not in condition]:
-        raise CirlError(f"--where {unclear[0]}: write COLUMN=TEXT, such as country=Japan")
+    conditions = values_by_name(rows, "--where", "COLUMN=TEXT, such as country=Japan", str)
     options: dict[str, Any] = {"kind": kind, "trend": trend, "unit": unit, "interval": interval, "seasons": seasons}
     fits = fit_disturbances(table, column, logarithm=not plain, rows=conditions, times=times, source=source, **options)
     for name, (change, error) in fits.trends.items():

@@ -198,11 +198,8 @@ def paper(
             common.say(f"{row}: once more, as {reasons[row]}")
         elif row in reasons:
             common.say(result_line(results.read(row)))
-    try:
+    with common.stoppable(f"finished rows are kept in {out}"):
         has_failures = _run_rows(rest, results, episodes, on, workers)
-    except KeyboardInterrupt:
-        common.say(f"\nstopped; finished rows are kept in {out}. The same command goes on.")
-        raise typer.Exit(130) from None
     results_on_disk, requests = results.read_all(), {_request(row) for row in rows}
     for environment_data in environments:
         fit = [result for result in results_on_disk if result.row in rows or _request(result.row) not in requests]

@@ -57,7 +57,8 @@ def new(
     """
     from cirl_marl.definitions.template import FirstCycle, write_first
 
-    products = dict(_product(text) for text in product or ())
+    form = "a name and two numbers, as in cars=120,14"
+    products = common.values_by_name(product, "--product", form, _mass_and_years)
     if products and (in_use, lifetime) != (None, None):
         raise CirlError("--product says how much is in use and how long; leave out --in-use and --lifetime")
     if not products:
@@ -69,14 +70,9 @@ def new(
     common.say(f"wrote {file}; next: cirl plan {file} --control optimum --min-service 1, and cirl train {file}")
 
 
-def _product(text: str) -> tuple[str, tuple[float, float]]:
-    """Return name, mass in use and lifetime of a product, as ``--product`` gives them."""
-    name, _, numbers = text.partition("=")
-    try:
-        in_use, lifetime = (float(number) for number in numbers.split(","))
-    except ValueError:
-        raise CirlError(f"--product {text}: needs a name and two numbers, as in cars=120,14") from None
-    return name.strip(), (in_use, lifetime)
+def _mass_and_years(text: str) -> tuple[float, float]:
+    in_use, lifetime = map(float, text.split(","))
+    return in_use, lifetime
 
 
 @common.app.command(rich_help_panel=common.NETWORKS)

@@ -16,8 +16,7 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
-from cirl_marl.cli.common import COMPARISONS, app, console, errors, folder_for
-from cirl_marl.errors import CirlError
+from cirl_marl.cli.common import COMPARISONS, app, console, end_with, errors, folder_for, values_by_name
 from cirl_marl.jobs import PLACES
 
 if TYPE_CHECKING:
@@ -57,7 +56,8 @@ def sweep(
     if out is not None:
         folder_for(out, "--out")
     printer = errors if as_json else console
-    options: dict[str, Any] = {"on": on, "workers": workers, "out": out, "settings": _settings(slurm or [])}
+    settings = values_by_name(slurm, "--slurm", "NAME=VALUE, such as partition=long", str)
+    options: dict[str, Any] = {"on": on, "workers": workers, "out": out, "settings": settings}
     try:
         with _live(as_json) as watch:
             say = partial(printer.print, soft_wrap=True, highlight=False, markup=False)
@@ -74,17 +74,7 @@ def sweep(
     done = sum(row["state"] == "done" for row in outcome.rows)
     message = f"{done} of {len(outcome.rows)} cells done; table: {outcome.folder / 'sweep.csv'}"
     printer.print(message, soft_wrap=True, highlight=False)
-    for failure in outcome.failures:
-        errors.print(f"failed: {failure}", soft_wrap=True, highlight=False, markup=False)
-    if outcome.failures:
-        raise typer.Exit(1)
-
-
-def _settings(assignments: Sequence[str]) -> dict[str, str]:
-    for assignment in assignments:
-        if "=" not in assignment:
-            raise CirlError(f"--slurm {assignment}: must be NAME=VALUE, such as partition=long")
-    return {name: value for name, _, value in (assignment.partition("=") for assignment in assignments)}
+    end_with(outcome.failures)
 
 
 @contextmanager
