@@ -504,18 +504,20 @@ def test_pictures_of_a_run_show_mean_circularity(trained: Path, monkeypatch: pyt
     drawn: dict[str, tuple[Any, ...]] = {}
     for name in ("save_before_after", "save_circularity"):
 
-        def record(path: Path, *arguments: Any, name: str = name) -> Path:
-            drawn[name] = arguments
+        def record(path: Path, *arguments: Any, name: str = name, title: str = "") -> Path:
+            drawn[name] = *arguments, title
             return path
 
         monkeypatch.setattr(pictures, name, record)
     shutil.copytree(trained, "run")
     evaluation = evaluate("run", episodes=2, bounds=False)
     pictures.draw_run(evaluation)
-    network, before, after, _, shown = drawn["save_before_after"]
+    network, before, after, _, shown, _ = drawn["save_before_after"]
     assert shown == pytest.approx([float(network.circularity(flow)) for _, flow in (before, after)], rel=1e-9)
     for name, curve in drawn["save_circularity"][2].items():
         assert curve.mean() == pytest.approx(evaluation.figures["controllers"][name]["circularity"]["value"], rel=1e-12)
+    pictures.draw("x.png", evaluation, title="a heading")
+    assert drawn["save_circularity"][-1] == "a heading"
 
 
 @pytest.mark.medium

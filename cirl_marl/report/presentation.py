@@ -94,7 +94,7 @@ def draw_circularity(path: Path, evaluation: Evaluation, *, title: str = "") -> 
     network, rollouts = evaluation.env.network, evaluation.rollouts
     means = {name: rollout.circularity_mean for name, rollout in rollouts.items()}
     services = {name: rollout.service for name, rollout in rollouts.items()}
-    return save_circularity(path, network, interval_ends(network), means, services)
+    return save_circularity(path, network, interval_ends(network), means, services, title=title)
 
 
 def summarise(result: object) -> RenderableType:
