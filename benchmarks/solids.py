@@ -75,7 +75,7 @@ def main(
         typer.echo(f"{run.name}: {each}")
     if len(found) > 1:
         means = [
-            over_seeds([[float(getattr(each, name).mean()) for each in found]]) for name in ("circularity", "service")
+            over_seeds([float(getattr(each, name).mean()) for each in found]) for name in ("circularity", "service")
         ]
         told = ", ".join(f"{each.value:.4g} [{each.low:.4g}, {each.high:.4g}]" for each in means)
         typer.echo(f"interquartile means of λ̄ (kg) and service over {len(found)} seeds, bootstrap intervals: {told}")

@@ -312,7 +312,7 @@ def _over(row: Row, samples: Sequence[Floats]) -> Aggregate:
     """Aggregate figures of episodes as ``Row.figure`` does; of several services the one that lacks most counts."""
     if samples[0].ndim == 2:
         samples = [each[:, each.mean(axis=0).argmin()] for each in samples]
-    return over_seeds([[float(each.mean()) for each in samples]]) if row.seeds else over_episodes(samples[0])
+    return over_seeds([float(each.mean()) for each in samples]) if row.seeds else over_episodes(samples[0])
 
 
 def _figure(found: Aggregate | None, form: str, *, interval: bool = True) -> str:

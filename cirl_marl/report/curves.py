@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.special import stdtrit
 
 from cirl_marl.drawing.style import (
     DASHES,
@@ -28,6 +27,7 @@ from cirl_marl.drawing.style import (
     time_axis,
 )
 from cirl_marl.errors import CirlError
+from cirl_marl.evaluation.statistics import mean_interval
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import Law
 
@@ -52,7 +52,13 @@ class PointSeries:
 
 
 def save_circularity(
-    path: str | Path, network: Network, time: Floats, runs: Mapping[str, Floats], services: Mapping[str, Floats]
+    path: str | Path,
+    network: Network,
+    time: Floats,
+    runs: Mapping[str, Floats],
+    services: Mapping[str, Floats],
+    *,
+    title: str = "",
 ) -> Path:
     """Save λ over time and, below it, the service level of several controls as a PNG and return its path.
 
@@ -69,8 +75,8 @@ def save_circularity(
     for axes, curves, top in ((above, runs, math.inf), (below, services, 1.0)):
         for name, values in curves.items():
             _draw_mean(axes, time, _check_length(name, values, time), name, names.index(name), top=top)
-    title = "Mean circularity of each step, averaged over episodes, with 95 % intervals"
-    style_axes(above, title=title, ylabel=f"λ / {network.mass_unit}")
+    subject = "Mean circularity of each step, averaged over episodes, with 95 % intervals"
+    style_axes(above, title=title or subject, ylabel=f"λ / {network.mass_unit}")
     style_axes(below, title="Service level", ylabel="service level")
     below.set_ylim(-0.03, 1.06)
     time_axis(below, time, network)
@@ -224,15 +230,13 @@ def _dots(time: Floats) -> str:
 
 def _draw_mean(axes: Axes, time: Floats, values: Floats, name: str, index: int, top: float = math.inf) -> None:
     episodes = np.atleast_2d(values)
-    count = len(episodes)
-    if count == 0:
+    if not len(episodes):
         return
     colour, dash = SERIES[index % len(SERIES)], DASHES[index % len(DASHES)]
-    mean = episodes.mean(axis=0)
+    mean, low, high = mean_interval(episodes, (-math.inf, top))
     axes.plot(time, mean, color=colour, linestyle=dash, linewidth=1.8, label=readable(name), marker=_dots(time))
-    if count > 1:
-        error = episodes.std(axis=0, ddof=1) / math.sqrt(count) * float(stdtrit(count - 1, 0.975))
-        axes.fill_between(time, mean - error, np.minimum(mean + error, top), color=colour, alpha=0.2, linewidth=0)
+    if len(episodes) > 1:
+        axes.fill_between(time, low, high, color=colour, alpha=0.2, linewidth=0)
 
 
 def _draw_returns(axes: Axes, steps: Floats, values: Floats) -> None:

@@ -7,7 +7,6 @@ from dataclasses import field, replace
 from typing import Annotated
 
 import numpy as np
-from scipy.special import stdtrit
 
 from cirl_marl.controllers.indicators import indicators
 from cirl_marl.controllers.rollout import Rollout, rollout
@@ -20,7 +19,7 @@ from cirl_marl.evaluation.comparison import FIGURES, Comparison
 from cirl_marl.evaluation.pareto import ParetoFront
 from cirl_marl.evaluation.sampling import SampledEpisodes
 from cirl_marl.evaluation.simulations import Simulation
-from cirl_marl.evaluation.statistics import SHARE, Aggregate, over_episodes
+from cirl_marl.evaluation.statistics import SHARE, Aggregate, mean_interval, over_episodes
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.mpc import SERVICE_FIRST
@@ -261,12 +260,9 @@ def _episode(
 
 
 def _mean(values: Floats, top: float) -> Band:
-    """Return the mean over episodes, shape (episodes, steps), with its 95 % interval (Student's t)."""
-    mean, count = values.mean(axis=0), len(values)
-    if count < 2:
-        return Band(mean)
-    error = values.std(axis=0, ddof=1) / np.sqrt(count) * float(stdtrit(count - 1, 0.975))
-    return Band(mean, mean - error, np.minimum(mean + error, np.maximum(top, mean)))
+    """Return the mean over episodes, shape (episodes, steps), with its interval, which ends at ``top``."""
+    mean, *ends = mean_interval(values, (-np.inf, top))
+    return Band(mean, *ends) if len(values) > 1 else Band(mean)
 
 
 def _quantiles(values: Floats) -> Band:
