@@ -72,7 +72,10 @@ def test_gradients_go_through_the_policies(
                 env.advance(actions)
                 if t + 1 < len(tape):
                     # what is seen changes by the slopes of the normaliser, from what was seen on the tape
-                    seen, before = (env._observe(state) for state in (env.physical, tape[t][0].after))
+                    seen, now_here = env.stacked_observation(), env.physical
+                    env.go_back(tape[t][0].after, controls)
+                    before = env.stacked_observation()
+                    env.go_back(now_here, controls)
                     change = np.zeros(inputs.shape)
                     for rows, span in zip(change, stack._observed, strict=True):
                         rows[:, : span.stop - span.start] = (seen[span] - before[span]).T

@@ -28,6 +28,9 @@ from cirl_marl.network.units import factor
 
 FLOW_KEYS = ("rate", "flow", "batches")
 """Keys of which a law needs one, if it takes any of them."""
+LISTS = {"services": elements.Service, "accounts": elements.Account, "substances": elements.Substance}
+"""Parts of a network that have ids, beside its compartments."""
+SETTINGS = {"episode": elements.Episode, "objective": elements.Objective, "observation": elements.Observation}
 SUBRECORDS = {"lifetime": elements.Lifetime, "rule": elements.FeedbackRule}
 """What tables within those of compartments become that need nothing else."""
 CONSTANT = "cannot change in time; fix the time, too, in 'where', and leave no column of times"
@@ -81,25 +84,17 @@ class Converter:
             self.scales[kind] = self._number(scale, kind, f"scales.{key}")
             if self.scales[kind] <= 0:
                 self.mistakes.append(f"scales.{key}: {self.scales[kind]} must be positive")
-        services = table.services.items()
         parts: dict[str, Any] = {
             "nodes": tuple(self._compartment(Node, id_, node, f"nodes.{id_}") for id_, node in table.nodes.items()),
             "arcs": tuple(self._compartment(Arc, id_, arc, f"arcs.{id_}") for id_, arc in table.arcs.items()),
-            "services": tuple(self._part(elements.Service, part, f"services.{id_}", id=id_) for id_, part in services),
-            "accounts": tuple(
-                self._part(elements.Account, part, f"accounts.{id_}", id=id_) for id_, part in table.accounts.items()
-            ),
-            "substances": tuple(
-                self._part(elements.Substance, part, f"substances.{id_}", id=id_)
-                for id_, part in table.substances.items()
-            ),
-            "episode": self._part(elements.Episode, table.episode, "episode"),
-            "objective": self._part(elements.Objective, table.objective, "objective"),
-            "observation": self._part(elements.Observation, table.observation, "observation"),
-            "disturbances": {
-                name: self._part(KINDS[entry.kind], entry, f"disturbances.{name}")
-                for name, entry in table.disturbances.items()
-            },
+        }
+        for key, record in LISTS.items():
+            entries = getattr(table, key).items()
+            parts[key] = tuple(self._part(record, part, f"{key}.{id_}", id=id_) for id_, part in entries)
+        parts |= {key: self._part(record, getattr(table, key), key) for key, record in SETTINGS.items()}
+        parts["disturbances"] = {
+            name: self._part(KINDS[entry.kind], entry, f"disturbances.{name}")
+            for name, entry in table.disturbances.items()
         }
         if table.disturbance_correlation is not None:
             correlation = self._part(Correlation, table.disturbance_correlation, "disturbance_correlation")

@@ -18,7 +18,7 @@ from typing import Any, TypeVar, overload
 
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network.calendar import YearOrDate
-from cirl_marl.records.files import LARGEST, read_content
+from cirl_marl.records.files import LARGEST, read_content, sha256_of
 
 T = TypeVar("T")
 CsvRow = str | list[str]
@@ -205,7 +205,7 @@ class DataFiles:
             CirlError: naming the file and what is wrong with it.
         """
         path = self._with_file_errors(name, self._path_of)
-        self._plain_files[name] = hashlib.sha256(read_content(path)).hexdigest()
+        self._plain_files[name] = sha256_of(path)
         return path
 
     def column(self, name: str, column: str, conditions: Mapping[str, str], times: str | None) -> Column:
@@ -273,7 +273,8 @@ class _Table:
                 raise CirlError(fault + ("" if len(self.header) > 1 else " Separate columns with commas."))
         matches = self._matching_rows(conditions)
         values = [self._number(i, column) for i in matches]
-        origin = f"{self.name}, column '{column}'" + (f", where {_conditions(conditions)}" if conditions else "")
+        conditions_text = " and ".join(f"{key} = '{value}'" for key, value in conditions.items())
+        origin = f"{self.name}, column '{column}'" + (f", where {conditions_text}" if conditions else "")
         if times is not None:
             return Column(self._times(matches, times), values, origin)
         if len(matches) > 1:
@@ -343,7 +344,3 @@ def _date(text: str) -> date | None:
         return date.fromisoformat(text)
     except ValueError:
         return None
-
-
-def _conditions(conditions: Mapping[str, str]) -> str:
-    return " and ".join(f"{key} = '{value}'" for key, value in conditions.items())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import difflib
-import hashlib
 import math
 import re
 import tomllib
@@ -23,7 +22,7 @@ from cirl_marl.definitions.region_copies import compose_copies, copied_file
 from cirl_marl.definitions.schema import NetworkTable
 from cirl_marl.errors import CirlError, DefinitionError, NetworkError, unknown_name
 from cirl_marl.network import Network
-from cirl_marl.records.files import read_content, write_atomically
+from cirl_marl.records.files import read_content, sha256_of, write_atomically
 
 DEFAULT = "default"
 """The scenario that stands outside ``[scenarios]``."""
@@ -53,7 +52,7 @@ class Definition:
         """
         self.path, self.files = path, DataFiles(path.parent)
         self._document = read_toml(path)
-        self.sha256 = hashlib.sha256(read_content(path)).hexdigest()
+        self.sha256 = sha256_of(path)
         overrides = self._document.get("scenarios", {})
         if not isinstance(overrides, dict) or not all(isinstance(scenario, dict) for scenario in overrides.values()):
             raise DefinitionError(str(path), ["scenarios: must be tables, as in [scenarios.paper]"])

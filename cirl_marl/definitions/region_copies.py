@@ -99,17 +99,14 @@ def _pattern(document: Document, original: Document, scenario: str) -> dict[str,
     pattern, removals = dict(original), set[str]()
     for prefix, change in changes:
         still = {key: _still(value, key, removals) for key, value in change.items() if key != "without"}
-        paths = [path for path in change.get("without", []) if not _in(path, removals)]
+        before = tuple(f"{removal}." for removal in removals)
+        paths = [path for path in change.get("without", []) if not f"{path}.".startswith(before)]
         mistakes = [*path_mistakes(pattern, paths, prefix), *stranger_mistakes(pattern, still, prefix)]
         if mistakes:
             raise NetworkError(of, mistakes)
         pattern = overlay(without_paths(pattern, {"without": paths}), still)
         removals |= set(paths)
     return pattern
-
-
-def _in(path: str, removals: set[str]) -> bool:
-    return any(path == removal or path.startswith(f"{removal}.") for removal in removals)
 
 
 def _still(value: Any, key: str, removals: set[str]) -> Any:

@@ -65,7 +65,7 @@ class Derivatives:
 
     def observation(self) -> Floats:
         """Return the present stacked observation in double precision, shape (entries of all agents, B)."""
-        return self.env.observe_into(self._table)
+        return self.env.stacked_observation(self._table)
 
     def pull_back(self, interval: Interval, adjoint: Outputs, path_adjoint: Floats) -> tuple[Floats, Floats, Floats]:
         """Return derivatives by masses at the start, actions and draws, given those by what an interval ended with.

@@ -92,10 +92,7 @@ class Scoring:
 
         It is 0 without a lower end; see ``levels``.
         """
-        quantity, low = self._measure(quantities), self._low
-        if self._vary_in_time:
-            low = low.take(step, axis=1)
-        low = self._factors[0](low, factors)
+        quantity, (low, _) = self._measure(quantities), self._bands(step, factors)
         ratio: Floats = np.divide(quantity, low, out=np.ones_like(quantity), where=low > 0)
         return 1.0 - ratio
 

@@ -296,7 +296,7 @@ class MultiAgentVectorEnv:
         start, factors = self._starts.begin(seed, options, uncertain=self.uncertain)
         self._state = self._fresh(start, factors, self._starts.paths(range(self.num_envs)))
         self.episodes = self.episodes + 1
-        return self.by_agent(self._observe(self._state))
+        return self.observations()
 
     def step(self, actions: Mapping[str, ArrayLike]) -> tuple[Observations, dict[str, Floats], Flags, Flags, Infos]:
         """Hold the actions, agent → array (num_envs, entries of its action) in [−1, 1], for one control interval.
@@ -497,7 +497,7 @@ class MultiAgentVectorEnv:
 
     def observations(self) -> Observations:
         """Return the observations that the agents act on next, equal to what the last reset, step or restore gave."""
-        return self.by_agent(self._observe(self.physical))
+        return self.by_agent(self.stacked_observation())
 
     def snapshot(self) -> Snapshot:
         """Return a copy of the state and the random streams; environments are not changed."""
@@ -511,7 +511,7 @@ class MultiAgentVectorEnv:
         self._starts.restore_streams(snapshot.streams)
         self._state = snapshot.state.copy()
         self.episodes = self.episodes + 1
-        return self.by_agent(self._observe(self._state))
+        return self.observations()
 
     def close(self) -> None:
         """Do nothing; the environment holds no resources."""
@@ -552,7 +552,7 @@ class MultiAgentVectorEnv:
             paths = episode
         fresh = self._fresh(start, factors, paths)
         self._state = fresh if len(copies) == self.num_envs else last.replace(over, fresh)
-        return self._observe(self._state)
+        return self.stacked_observation()
 
     def _next_interval(self) -> Integers:
         """Return the index of the next interval in each copy, shape (num_envs,); at the end that of the last."""
@@ -600,11 +600,9 @@ class MultiAgentVectorEnv:
         stocks = self.rows.stocks(state.stock)
         return np.concatenate([stocks, through, state.flow, state.inner, state.measures, loads, substances])
 
-    def observe_into(self, table: Floats) -> Floats:
-        """Return the stacked observation by way of ``table``, of its precision (``ObservationLayout.observe``)."""
-        return self._observe(self.physical, table)
-
-    def _observe(self, state: State, table: Floats | None = None) -> NDArray[Any]:
+    def stacked_observation(self, table: Floats | None = None) -> NDArray[Any]:
+        """Return the present observations, shape (entries of all agents, B), by way of a ``table`` of ``layout``."""
+        state = self.physical
         quantities = self.quantities(state)
         time = state.step / self.network.episode.horizon
         done = np.maximum(state.step - 1, 0)

@@ -125,23 +125,23 @@ class Row:
             return None
         if not self.seeds:
             return over_episodes(samples[0], LIMITS.get(name, EVERYWHERE))
-        return over_seeds([[sample.mean() for sample in samples]])
+        return over_seeds([sample.mean() for sample in samples])
 
     def levels(self) -> list[Aggregate]:
         """Return the mean level of each service: over several seeds the IQM, else over the episodes."""
         rows = np.moveaxis(np.array([entry.rollout.episode_levels for entry in self.entries]), 2, 0)
-        return [over_seeds([row.mean(axis=1)]) if len(row) > 1 else over_episodes(row[0], SHARE) for row in rows]
+        return [over_seeds(row.mean(axis=1)) if len(row) > 1 else over_episodes(row[0], SHARE) for row in rows]
 
     def accounts(self) -> list[Aggregate]:
         """Return the total of each account, likewise."""
         rows = np.moveaxis(np.array([entry.rollout.accounts for entry in self.entries]), 2, 0)
-        return [over_seeds([row.mean(axis=1)]) if len(row) > 1 else over_episodes(row[0]) for row in rows]
+        return [over_seeds(row.mean(axis=1)) if len(row) > 1 else over_episodes(row[0]) for row in rows]
 
     def worst(self) -> list[Aggregate]:
         """Return the mean of the 5 % worst episodes of λ̄, then of the level of each service, likewise."""
         figures = [np.column_stack([entry.circularity, entry.rollout.episode_levels]) for entry in self.entries]
         tails = [[worst_mean(column) for column in of_entry.T] for of_entry in figures]
-        return [over_seeds([[t.value for t in row]]) if len(row) > 1 else row[0] for row in zip(*tails, strict=True)]
+        return [over_seeds([t.value for t in row]) if len(row) > 1 else row[0] for row in zip(*tails, strict=True)]
 
 
 @dataclass(frozen=True, slots=True)

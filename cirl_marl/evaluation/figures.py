@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
@@ -19,6 +18,7 @@ from cirl_marl.evaluation.statistics import SHARE, Aggregate, over_episodes, wor
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum.bounds import relative
+from cirl_marl.records.files import sha256_of
 from cirl_marl.records.machine import versions
 
 
@@ -93,15 +93,10 @@ def _run(run: RunDirectory) -> dict[str, Any]:
         "seed": config.seed,
         "state": status["state"],
         "joint_steps": status["joint_steps"],
-        "config_sha256": _hash((run.path / "config.json").read_bytes()),
-        "network_sha256": _hash(run.definition.read_bytes()),
+        "config_sha256": sha256_of(run.path / "config.json"),
+        "network_sha256": sha256_of(run.definition),
         "data_sha256": config.data_sha256,
         "policies_sha256": {
-            group.name: _hash((run.acting_checkpoint / f"{group.name}.safetensors").read_bytes())
-            for group in run.groups()
+            group.name: sha256_of(run.acting_checkpoint / f"{group.name}.safetensors") for group in run.groups()
         },
     }
-
-
-def _hash(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()

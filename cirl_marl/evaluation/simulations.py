@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
@@ -175,7 +174,11 @@ def simulate_alternatives(
     for i, ((env, control), controller) in enumerate(zip(cases, controllers, strict=True)):
         choices = ((env.network.scenario_name, envs), (control, names))
         name = ", ".join(choice for choice, among in choices if len(among) > 1)
-        origin, report = episode_start(env, seed), partial(_tell, progress, i, len(cases))
+        origin = episode_start(env, seed)
+
+        def report(share: float, done: int = i) -> None:
+            progress((done + share) / len(cases))
+
         try:
             run = origin.play(env, controller, progress=report)
         except CirlError as error:
@@ -209,11 +212,6 @@ def _refuse(
             pair = f"'{envs[0].network.scenario_name}' and '{env.network.scenario_name}'"
             name = env.network.name
             raise CirlError(f"network '{name}': scenarios {pair} cannot be compared: {'; '.join(obstacles)}")
-
-
-def _tell(progress: Callable[[float], None], done: int, of: int, share: float) -> None:
-    """Tell the share of all episodes that is done, when ``done`` of them and a share of the next are."""
-    progress((done + share) / of)
 
 
 def _obstacles(first: Network, second: Network) -> Iterator[str]:

@@ -158,7 +158,8 @@ class _Driver:
                 self._queue.remove(job)
                 self._states[job.name] = "running"
                 self._last_report.pop(job.name, None)
-                self._at_work[job.name] = job, place.start(self._work(job))
+                work = Work(job, self._files[job.name], os.getcwd(), is_code_allowed())
+                self._at_work[job.name] = job, place.start(work)
         rest = bool(self._queue or self._at_work)
         self._look(at_once=not rest)
         return rest
@@ -208,9 +209,6 @@ class _Driver:
         self._last_report.pop(job.name, None)
         if failure is not None:
             self.failures.append(failure)
-
-    def _work(self, job: Job) -> Work:
-        return Work(job, self._files[job.name], os.getcwd(), is_code_allowed())
 
     def _look(self, at_once: bool = False) -> None:
         """Call who watches, unless that was a moment ago."""

@@ -33,16 +33,8 @@ AGE = 2.0
 SILENCE = 600.0
 """Seconds without an answer of the controller after which it is given up."""
 LIVE = {
-    "PENDING",
-    "RUNNING",
-    "SUSPENDED",
-    "COMPLETING",
-    "CONFIGURING",
-    "REQUEUED",
-    "RESIZING",
-    "SIGNALING",
-    "STAGE_OUT",
-}
+    "PENDING", "RUNNING", "SUSPENDED", "COMPLETING", "CONFIGURING", "REQUEUED", "RESIZING", "SIGNALING", "STAGE_OUT",
+}  # fmt: skip
 """States of a job that has not ended."""
 CUT_OFF = {"TIMEOUT", "PREEMPTED", "NODE_FAIL", "BOOT_FAIL", "REQUEUE_FED", "DEADLINE"}
 """States of a job that was ended by Slurm, and whose work goes on in another one."""

@@ -94,7 +94,8 @@ class JobFiles:
             return {}
         content = read_record(self.progress_file)
         for name, value in content.items():
-            if not (isinstance(value, str) if name in TEXTS else value is None or _is_number(value)):
+            number = value is None or isinstance(value, float) or (type(value) is int and abs(value) < MOST)
+            if not (isinstance(value, str) if name in TEXTS else number):
                 raise RunError(f"{self.progress_file}: is not what a job told: {name} is {value!r:.80}")
         done, total = content.get("done"), content.get("total")
         if content and not (done is not None and total is not None and 0 <= done < MOST and 0 < total < MOST):
@@ -167,10 +168,6 @@ def do(job: Job, files: JobFiles, listen: Callable[[], None]) -> None:
     except Exception as error:
         write_json(files.progress_file, progress | {"said": f"{type(error).__name__}: {error}"})
         raise
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, float) or (type(value) is int and abs(value) < MOST)
 
 
 def last_line(file: Path) -> str:

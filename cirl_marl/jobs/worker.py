@@ -7,7 +7,6 @@ import pickle
 import signal
 import sys
 from pathlib import Path
-from typing import NoReturn
 
 from cirl_marl.errors import RunError
 from cirl_marl.jobs.work import EXIT_STOPPED, Work
@@ -24,15 +23,11 @@ def main(file: Path, sha256: str) -> None:
         raise RunError(f"{file}: is not what was put into the queue")
     # written by the driver, as the hash in its script says
     work: Work = pickle.loads(payload)
-    signal.signal(signal.SIGTERM, _stop)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C does
     try:
         work()
     except KeyboardInterrupt:
         sys.exit(EXIT_STOPPED)
-
-
-def _stop(number: int, frame: object) -> NoReturn:
-    raise KeyboardInterrupt
 
 
 if __name__ == "__main__":

@@ -106,33 +106,30 @@ def parameter_mistakes(name: str, parameters: Mapping[str, Any]) -> Iterator[str
         place = f"parameters.{key}"
         if key not in signature:
             yield f"parameters: {unknown_name(f'parameter of {name}', key, signature)}"
-        elif infinite := list(_not_finite(place, value)):
-            yield from infinite
+        elif infinite := {part: x for part, x in _leaves(place, value) if _is_infinite(x)}:
+            yield from (f"{part}: must be a finite number, got {number!r}" for part, number in infinite.items())
         elif not _takes(signature[key], value):
             if key in TABLE_CHECKS:
                 yield from TABLE_CHECKS[key](place, value)
             else:
                 yield f"{place}: {name} needs {_requirement(signature[key])}, got {value!r}"
         elif key == "policy_kwargs" and value:
-            yield from _width_mistakes(f"{place}.net_arch", value.get("net_arch"))
+            for part, width in _leaves(f"{place}.net_arch", value.get("net_arch")):
+                if isinstance(width, bool | float) or (isinstance(width, int) and not 1 <= width <= WIDEST):
+                    yield f"{part}: a layer has 1 to {WIDEST:,} units, got {width!r}"
 
 
-def _width_mistakes(place: str, value: object) -> Iterator[str]:
-    """Yield every width that no layer has, in lists and in tables of lists."""
+def _is_infinite(value: object) -> bool:
+    return isinstance(value, float | np.floating) and not math.isfinite(value)
+
+
+def _leaves(place: str, value: object) -> Iterator[tuple[str, object]]:
+    """Yield every value in tables and lists with its path."""
     if isinstance(value, Mapping | list | tuple):
         for key, part in value.items() if isinstance(value, Mapping) else enumerate(value):
-            yield from _width_mistakes(f"{place}.{key}", part)
-    elif isinstance(value, int | float) and (isinstance(value, bool | float) or not 1 <= value <= WIDEST):
-        yield f"{place}: a layer has 1 to {WIDEST:,} units, got {value!r}"
-
-
-def _not_finite(place: str, value: object) -> Iterator[str]:
-    """Yield every number that is not finite, in tables and lists as well."""
-    if isinstance(value, float | np.floating) and not math.isfinite(value):
-        yield f"{place}: must be a finite number, got {value!r}"
-    elif isinstance(value, Mapping | list | tuple):
-        for key, part in value.items() if isinstance(value, Mapping) else enumerate(value):
-            yield from _not_finite(f"{place}.{key}", part)
+            yield from _leaves(f"{place}.{key}", part)
+    else:
+        yield place, value
 
 
 def _takes(parameter: inspect.Parameter, value: object) -> bool:

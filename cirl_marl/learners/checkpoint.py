@@ -30,15 +30,8 @@ KIND = "__kind__"
 CRITICS = ("value_net.", "mlp_extractor.value_net.", "critic.", "critic_target.", "actor_target.")
 """Beginnings of the names of parameters by which no policy acts."""
 UNREADABLE = (
-    OSError,
-    ValueError,
-    LookupError,
-    TypeError,
-    AttributeError,
-    RecursionError,
-    OverflowError,
-    SafetensorError,
-)
+    OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError, SafetensorError,
+)  # fmt: skip
 """What damaged files, or those of something else, raise."""
 
 
@@ -159,7 +152,7 @@ def model_state(model: BaseAlgorithm) -> dict[str, Any]:
         "parameters": model.get_parameters(),
         "variables": variables(model),
         "values": {k: v for k, v in vars(model).items() if k not in settings and _is_progress(v)},
-        "noise": [_plain_of(noise) for noise in _noises(model)],
+        "noise": [{k: v for k, v in vars(noise).items() if isinstance(v, np.ndarray)} for noise in _noises(model)],
         "matrices": [{name: getattr(explorer, name) for name in MATRICES} for explorer in _explorers(model)],
         "action_stream": model.action_space.np_random.bit_generator.state,
     }
@@ -304,10 +297,6 @@ def _like(now: Any, value: Any) -> Any:
     if isinstance(now, tuple) and hasattr(now, "_fields"):
         return type(now)(*value)
     return value
-
-
-def _plain_of(part: object) -> dict[str, Any]:
-    return {name: value for name, value in vars(part).items() if isinstance(value, np.ndarray)}
 
 
 def _noises(model: BaseAlgorithm) -> Iterator[Any]:

@@ -23,7 +23,6 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import json
 import re
 import shutil
@@ -41,7 +40,15 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import RunError, unknown_name
 from cirl_marl.learners.recipe import OPTIONS, Group, Recipe, Settings
 from cirl_marl.network import Network
-from cirl_marl.records.files import read_content, read_record, refuse_links, sync, write_atomically, write_json
+from cirl_marl.records.files import (
+    read_content,
+    read_record,
+    refuse_links,
+    sha256_of,
+    sync,
+    write_atomically,
+    write_json,
+)
 from cirl_marl.records.machine import versions
 
 STATES = ("running", "complete", "interrupted", "failed")
@@ -115,7 +122,7 @@ class RunDirectory:
             shutil.rmtree(run.path)
         if run.path.exists() and (not run.path.is_dir() or any(run.path.iterdir())):
             raise RunError(f"{run.path}: already exists and is not empty; choose another directory, or resume it")
-        config = config.model_copy(update={"definition_sha256": hashlib.sha256(definition.read_bytes()).hexdigest()})
+        config = config.model_copy(update={"definition_sha256": sha256_of(definition)})
         try:
             plain = config.model_dump(mode="json")
             json.dumps(plain)
@@ -264,7 +271,7 @@ class RunDirectory:
         if config.definition_sha256:
             files[self.definition] = config.definition_sha256
         for file, sha256 in files.items():
-            if (actual := hashlib.sha256(read_content(file)).hexdigest()) != sha256:
+            if (actual := sha256_of(file)) != sha256:
                 raise RunError(f"{file}: is not the file of this training, whose SHA-256 was {sha256}; it is {actual}")
         address = f"{self.definition}:{config.region}" if config.region else self.definition
         return load_network(address, scenario=config.scenario)

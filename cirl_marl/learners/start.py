@@ -8,7 +8,6 @@ and a policy that sees the same state in other numbers forgets.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
@@ -23,6 +22,7 @@ from cirl_marl.learners.learner import Learner, load_acting_learner
 from cirl_marl.learners.recipe import LearnerSettings, Start
 from cirl_marl.learners.run_directory import Origin, RunDirectory
 from cirl_marl.learners.views import CENTRAL_CRITIC
+from cirl_marl.records.files import sha256_of
 
 NAMES_LISTED = 3
 """Entries that a message lists of those that differ."""
@@ -61,7 +61,7 @@ def _begin_from(run: RunDirectory, start: Start, learner: Learner, env: MultiAge
     learner.model.policy.load_state_dict(learner.model.policy.state_dict() | weights)
     _take_over(source_learner, learner, start)
     files = [folder / f"{name}.{kind}" for kind in ("json", "safetensors")]
-    hashes = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+    hashes = {file.name: sha256_of(file) for file in files}
     return Origin(run=start.recipe or str(run.path.resolve()), agent=name, checkpoint=folder.name, sha256=hashes)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import os
 import shutil
@@ -54,6 +55,11 @@ def read_content(path: Path) -> bytes:
         raise OSError(f"'{path}' has {size / 1e6:.0f} MB, and at most {LARGEST // 10**6} MB are read")
     with path.open("rb") as file:
         return file.read(size)
+
+
+def sha256_of(path: Path) -> str:
+    """Return the hash of what is in a regular file; errors are those of ``read_content``."""
+    return hashlib.sha256(read_content(path)).hexdigest()
 
 
 def read_json(path: Path) -> Any:

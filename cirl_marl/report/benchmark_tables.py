@@ -39,17 +39,11 @@ def scores_by_algorithm(rows: Sequence[ResultRow]) -> dict[str, Floats]:
     """
     scores: dict[str, Floats] = {}
     for name in who_acts(rows):
-        by_task = [
-            sorted((row for row in rows if (row.algorithm, row.task, row.variant) == (name, task, 0)), key=_seed)
-            for task in tasks()
-        ]
+        own_rows = sorted((row for row in rows if (row.algorithm, row.variant) == (name, 0)), key=lambda r: r.seed or 0)
+        by_task = [[row for row in own_rows if row.task == task] for task in tasks()]
         if count := min(map(len, by_task)):
             scores[name] = np.array([[row.score for row in part[:count]] for part in by_task])
     return scores
-
-
-def _seed(row: ResultRow) -> int:
-    return row.seed or 0
 
 
 def gap_cells(rows: Sequence[ResultRow]) -> Cells:
@@ -86,13 +80,9 @@ def improvement_cells(rows: Sequence[ResultRow]) -> Cells:
     names = [name for name in scores if name != "neutral"]
     body = []
     for name in names:
-        cells = ["" if rival == name else _improvement(scores[name], scores[rival]) for rival in names]
-        body.append([name.replace("_", " "), *cells])
+        by_rival = {rival: probability_of_improvement(scores[name], scores[rival]) for rival in names if rival != name}
+        body.append([name.replace("_", " "), *(_figure(by_rival[rival]) if rival != name else "" for rival in names)])
     return ["better than", *(name.replace("_", " ") for name in names)], body
-
-
-def _improvement(scores: Floats, rival_scores: Floats) -> str:
-    return _figure(probability_of_improvement(scores, rival_scores))
 
 
 def _figure(figure: Aggregate) -> str:
@@ -110,14 +100,8 @@ def held_out_cells(rows: Sequence[ResultRow]) -> Cells:
         if held_out and base_rows:
             service_share = np.mean([load_task(row.task).score(0.0, row.service) for row in held_out])
             means = [np.mean([row.score for row in part]) for part in (base_rows, held_out)]
-            body.append(
-                [
-                    name.replace("_", " "),
-                    f"{len(base_rows)}",
-                    *(f"{mean:.3f}" for mean in means),
-                    f"{service_share:.0%}",
-                ]
-            )
+            figures = [f"{mean:.3f}" for mean in means]
+            body.append([name.replace("_", " "), f"{len(base_rows)}", *figures, f"{service_share:.0%}"])
     return ["who acts", "policies", "score", "score on held-out variants", "of these served"], body
 
 

@@ -13,9 +13,8 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -143,7 +142,7 @@ def _series(network: Network, control: str) -> Iterator[YearlyRow]:
     def row(region: str, variable: str, unit: str, values: Callable[[Rollout], Floats]) -> YearlyRow:
         return [model, scenario, region, variable, unit], values
 
-    def at(place: int, values: Callable[[Rollout, int], Floats]) -> Callable[[Rollout], Floats]:
+    def at(place: Any, values: Callable[[Rollout, Any], Floats]) -> Callable[[Rollout], Floats]:
         return lambda run: values(run, place)
 
     def place(id_: str) -> tuple[str, str]:
@@ -163,7 +162,7 @@ def _series(network: Network, control: str) -> Iterator[YearlyRow]:
     for s, substance in enumerate(network.substances):
         for c, id_ in enumerate(network.compartments):
             region, name = place(id_)
-            content = partial(_content, s, c)
+            content = at((s, c), lambda run, pair: run.contents[:, *pair])
             yield row(region, f"Content|{substance.id}|{name}", "1", content)
     for a, account in enumerate(network.accounts):
         title, unit = account.title or account.id, f"{account.unit}/yr"
@@ -172,13 +171,4 @@ def _series(network: Network, control: str) -> Iterator[YearlyRow]:
         for entry in np.flatnonzero(ledger.account == a).tolist():
             parts.setdefault(place(ledger.compartments[entry]), []).append(entry)
         for (region, name), entries in parts.items():
-            yield row(region, f"{title}|{name}", unit, partial(_amounts, entries))
-
-
-def _content(substance: int, compartment: int, run: Rollout) -> Floats:
-    return run.contents[:, substance, compartment]
-
-
-def _amounts(entries: list[int], run: Rollout) -> Floats:
-    """Return what some entries come to in each interval, shape (steps,)."""
-    return np.asarray(run.entries[:, entries].sum(axis=1))
+            yield row(region, f"{title}|{name}", unit, at(entries, lambda run, rows: run.entries[:, rows].sum(axis=1)))

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from cirl_marl.drawing.style import FAINT, INK, NEUTRAL, SERIES, WARNING, WIDTH, draw_steps, number, save, style_axes
 from cirl_marl.evaluation.figures import provenance
-from cirl_marl.evaluation.levers import Levers, Trial
+from cirl_marl.evaluation.levers import Levers
 from cirl_marl.records.files import publish_result
 from cirl_marl.report.terminal import text_table
 
@@ -61,12 +61,10 @@ def _rows(levers: Levers) -> Iterator[list[object]]:
     for place, row in enumerate(levers.rows):
         trials, books = (row.alone, row.added, row.without), levers.account_changes(place).tolist()
         parts = zip(trials, levers.changes(place), books, strict=True)
-        cells = [cell for trial, change, amounts in parts for cell in (*_figures(trial, change), *amounts)]
+        cells: list[object] = []
+        for trial, change, amounts in parts:
+            cells += [trial.circularity, change, trial.service, trial.bound, trial.gap, *amounts]
         yield [row.name, " ".join(row.agents), *cells, levers.share(place)]
-
-
-def _figures(trial: Trial, change: float) -> list[float | None]:
-    return [trial.circularity, change, trial.service, trial.bound, trial.gap]
 
 
 def save_levers(path: str | Path, levers: Levers, *, title: str = "") -> Path:

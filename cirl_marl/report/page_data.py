@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from typing import Any
 
 import numpy as np
@@ -17,10 +17,9 @@ from cirl_marl.drawing.flow_diagram import LETTERS, FlowDiagram, flow_diagrams
 from cirl_marl.drawing.layered import RibbonRoute
 from cirl_marl.drawing.style import label_lines, readable
 from cirl_marl.errors import CirlError
-from cirl_marl.evaluation.statistics import Aggregate
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.calendar import labels
-from cirl_marl.network.elements import Arc, Service
+from cirl_marl.network.elements import Service
 from cirl_marl.network.series import extremes
 from cirl_marl.records.machine import versions
 from cirl_marl.report.decisions import settings
@@ -96,7 +95,7 @@ def _clock(episodes: Sequence[PageEpisode]) -> Values:
 
 def _network(network: Network, episodes: Sequence[PageEpisode]) -> Values:
     peaks = np.max([np.abs(np.nan_to_num(episode.flow)).max(axis=0) for episode in episodes], axis=0)
-    sources = stated_numbers(network)
+    sources, changing = stated_numbers(network), network.time_dependent
     nodes = [
         {
             "id": node.id,
@@ -115,7 +114,7 @@ def _network(network: Network, episodes: Sequence[PageEpisode]) -> Values:
             "donor": int(network.donors[k]),
             "recipient": int(network.recipients[k]),
             "sign": -int(network.sustainability[k]),
-            "law": _law(network, arc),
+            "law": f"Law {arc.law.value}" + ("" if arc.id in changing else f": {law_text(network, arc)}"),
             "told": _sources(sources["arcs"].get(arc.id, ())),
         }
         for k, arc in enumerate(network.arcs)
@@ -155,10 +154,6 @@ def _substance(network: Network, place: int, episodes: Sequence[PageEpisode]) ->
     return {"id": id_, "label": readable(id_), "highest": _number(colours.highest), "steps": steps}
 
 
-def _law(network: Network, arc: Arc) -> str:
-    return f"Law {arc.law.value}" + ("" if arc.id in network.time_dependent else f": {law_text(network, arc)}")
-
-
 def _service(network: Network, service: Service, sources: Iterable[StatedNumber]) -> Values:
     providers = ", ".join(network.compartments[provider].label for provider in service.providers)
     low, high = extremes(service.low)
@@ -178,6 +173,7 @@ def _sources(numbers: Iterable[StatedNumber]) -> list[list[str]]:
 
 def _episode(episode: PageEpisode, network: int) -> Values:
     start = np.full(len(episode.network.stores), np.nan) if episode.start is None else episode.start
+    contents = np.empty((len(episode.flow), 0, 0)) if episode.contents is None else episode.contents
     stocks, throughput = np.concatenate([start[None], episode.stock]).T, episode.network.throughput(episode.flow.T)
     return {
         "name": episode.name,
@@ -191,15 +187,10 @@ def _episode(episode: PageEpisode, network: int) -> Values:
         "services": [_band(level) for level in episode.levels],
         "disturbances": [_band(values) for values in episode.disturbances],
         "accounts": [_band(values) for values in episode.accounts],
-        "contents": [] if episode.contents is None else [_rows(part) for part in episode.contents.swapaxes(0, 1)],
+        "contents": [[_list(row) for row in part.T] for part in contents.swapaxes(0, 1)],
         "about": episode.about,
-        "figures": {name: _aggregate(figure) for name, figure in episode.figures.items() if figure is not None},
+        "figures": {name: [*map(_number, astuple(f))] for name, f in episode.figures.items() if f is not None},
     }
-
-
-def _rows(table: Floats) -> list[list[float | None]]:
-    """Return a list for each compartment of a table of shape (steps, compartments)."""
-    return [_list(row) for row in table.T]
 
 
 def _diagram(diagram: FlowDiagram) -> Values:
@@ -230,10 +221,6 @@ def _route(route: RibbonRoute) -> Values:
 def _band(band: Band) -> Values:
     curves = {"value": band.value, "low": band.low, "high": band.high}
     return {name: _list(values) for name, values in curves.items() if values is not None}
-
-
-def _aggregate(aggregate: Aggregate) -> list[float | None]:
-    return [_number(figure) for figure in (aggregate.value, aggregate.low, aggregate.high)]
 
 
 def _series(values: Floats) -> float | list[float | None] | None:

@@ -13,9 +13,9 @@ from filelock import FileLock
 
 from cirl_marl.errors import CirlError, RunError, unknown_name
 from cirl_marl.network.declarations import KeptRecord, frozen_record
-from cirl_marl.records.files import write_table
+from cirl_marl.records.files import sha256_of, write_table
 from cirl_marl.suite.tasks import CONTROLLERS, PACKAGE_DATA, BenchmarkTask, Figures, load_task, tasks
-from cirl_marl.suite.weights import controller_of, sha256_of
+from cirl_marl.suite.weights import controller_of
 
 if TYPE_CHECKING:
     from cirl_marl.learners.interface import Trained

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
@@ -23,6 +22,7 @@ from cirl_marl.evaluation.statistics import SHARE, Aggregate, over_episodes
 from cirl_marl.learners.recipe import Recipe, load_recipe
 from cirl_marl.network import Network
 from cirl_marl.network.declarations import frozen_record, positional_record
+from cirl_marl.records.files import sha256_of
 from cirl_marl.suite.held_out import VARIANTS, variant_of
 from cirl_marl.suite.task_bounds import TaskBound
 
@@ -104,8 +104,7 @@ class BenchmarkTask:
         path = self.bound_path
         if not path.is_file():
             raise RunError(f"task '{self.name}': its bound is missing: {path}")
-        actual = hashlib.sha256(path.read_bytes()).hexdigest()
-        if self.sha256 and actual != self.sha256[self.variant]:
+        if self.sha256 and sha256_of(path) != self.sha256[self.variant]:
             raise RunError(f"{path}: is not the bound of '{self.name}', whose SHA-256 is {self.sha256[self.variant]}")
         return TaskBound.read(path)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import hashlib
 import json
 import shutil
 import tempfile
@@ -20,7 +19,7 @@ from cirl_marl.controllers.basic import Controller, Neutral
 from cirl_marl.errors import RunError
 from cirl_marl.optimum.blind import Replay
 from cirl_marl.optimum.mpc import MPC
-from cirl_marl.records.files import write_atomically
+from cirl_marl.records.files import sha256_of, write_atomically
 from cirl_marl.suite.tasks import BenchmarkTask
 
 LARGEST_FILE = 64_000
@@ -54,11 +53,6 @@ def read_weights(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         raise RunError(f"{path}: no such file of weights") from None
     except (OSError, KeyError, ValueError, SafetensorError) as error:
         raise RunError(f"{path}: is no file of weights: {error!r}") from error
-
-
-def sha256_of(path: Path) -> str:
-    """Return the hash of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def controller_of(
