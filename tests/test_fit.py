@@ -265,6 +265,8 @@ def test_gaps_and_rows(tmp_path: Path) -> None:
         fit_disturbances(write(tmp_path / "t.csv", {"x": RISING}, years), ["x"])
     with pytest.raises(CirlError, match="two columns would give a disturbance called 'x_1'"):
         fit_disturbances(write(tmp_path / "t.csv", {"x 1": RISING, "X_1": RISING}), ["x 1", "X_1"])
+    columns = {"Fläche": RISING, "2°": RISING}
+    assert [*fit_disturbances(write(tmp_path / "t.csv", columns), [*columns]).disturbances] == ["flache", "series_2"]
     table = tmp_path / "long.csv"
     rows = [
         (place, year, value)

@@ -52,7 +52,7 @@ class Residual:
 
     def __str__(self) -> str:
         """Say it as in a message."""
-        place = ", ".join(filter(None, (self.region, str(self.year), self.substance)))
+        place = _place(self.region, self.year, self.substance)
         return f"'{self.process}' ({place}): {self.inflow:g} enter, {self.outflow:g} leave"
 
 
@@ -71,7 +71,7 @@ class Change:
     @property
     def place(self) -> str:
         """Where and when it is, and of what."""
-        return ", ".join(filter(None, (self.region, str(self.year), self.substance)))
+        return _place(self.region, self.year, self.substance)
 
     @property
     def in_deviations(self) -> float:
@@ -127,7 +127,7 @@ class Processes:
             self._incidence[self._place[pair.target], k] += 1.0
         inflow, outflow = self._sums(1.0, self.flows), self._sums(-1.0, self.flows)
         stays = inflow - outflow
-        beyond = np.abs(stays) > self._tolerance()[:, None, None]
+        beyond = np.abs(stays) > _rounding(self.flows)
         whole = inflow.sum(axis=(0, 1))
         grows = stays.sum(axis=(0, 1)) >= GROWS * whole
         self.kinds: dict[str, ProcessKind] = {}
@@ -146,6 +146,8 @@ class Processes:
                 kind = ProcessKind.TRANSIT
             self.kinds[name] = kind
         self.inferred_stores = tuple(inferred)
+        self._transit = np.array([kind is ProcessKind.TRANSIT for kind in self.kinds.values()])
+        self._balances = self._incidence[self._transit]
 
     def of(self, *kinds: ProcessKind) -> tuple[str, ...]:
         """Return the processes of some kinds."""
@@ -163,8 +165,7 @@ class Processes:
 
     def _off(self, substance: str, flows: Floats) -> Iterator[Residual]:
         inflow, outflow = self._sums(1.0, flows), self._sums(-1.0, flows)
-        transit = np.array([kind is ProcessKind.TRANSIT for kind in self.kinds.values()])
-        wrong = (np.abs(inflow - outflow) > ROUNDING * flows.max(axis=(1, 2))[:, None, None]) & transit
+        wrong = (np.abs(inflow - outflow) > _rounding(flows)) & self._transit
         regions, years = self._table.regions, self._table.years
         for r, y, i in np.argwhere(wrong).tolist():
             yield Residual(self.names[i], regions[r], years[y], inflow[r, y, i], outflow[r, y, i], substance)
@@ -190,8 +191,7 @@ class Processes:
         """Return the processes without stock of whose outflows nothing is told; of a substance, region and year."""
         assert self._table.substances is not None
         is_told = np.isfinite(self._table.substances.is_content[place])
-        transit = np.array([kind is ProcessKind.TRANSIT for kind in self.kinds.values()])
-        silent: Integers = np.flatnonzero(transit & ~((np.maximum(-self._incidence, 0.0) @ is_told) > 0))
+        silent: Integers = np.flatnonzero(self._transit & ~((np.maximum(-self._incidence, 0.0) @ is_told) > 0))
         return silent
 
     def check_contents(self) -> None:
@@ -200,7 +200,7 @@ class Processes:
         if table.substances is None:
             return
         for r, y, k in excesses(table.substances.amounts, self.flows):
-            place = f"{table.regions[r]}, {table.years[y]}" if table.regions[r] else str(table.years[y])
+            place = _place(table.regions[r], table.years[y])
             parts = zip(table.substances.names, table.substances.amounts[:, r, y, k].tolist(), strict=True)
             listing = " and ".join(f"{amount:g} {name}" for name, amount in parts if amount)
             flow = f"{table.pairs[k]} ({place}): {listing} in {self.flows[r, y, k]:g} {table.unit}"
@@ -215,9 +215,7 @@ class Processes:
         """
         table, flows = self._table, self.flows.copy()
         stated_deviations = table.grid(table.deviations, np.nan)
-        rows = np.array([kind is ProcessKind.TRANSIT for kind in self.kinds.values()])
-        balances, changes = self._incidence[rows], []
-        chi_square, degrees = 0.0, 0
+        balances, changes, chi_square, degrees = self._balances, [], 0.0, 0
         for r, region in enumerate(table.regions):
             for y, year in enumerate(table.years):
                 table_flow = self.flows[r, y]
@@ -225,9 +223,8 @@ class Processes:
                 deviations = np.where(np.isnan(stated), UNCERTAIN * table_flow, stated)
                 closest = _closest(table_flow, np.where(table_flow > 0, deviations, 0.0), balances)
                 if closest is None:
-                    place = f"{region}, {year}" if region else str(year)
-                    remedy = "state how uncertain they are"
-                    raise CirlError(f"{table.name}: {place}: flows whose uncertainty is 0 do not balance; {remedy}")
+                    fault = "flows whose uncertainty is 0 do not balance; state how uncertain they are"
+                    raise CirlError(f"{table.name}: {_place(region, year)}: {fault}")
                 free = (deviations > 0) & (table_flow > 0)
                 chi_square += float((((closest - table_flow)[free] / deviations[free]) ** 2).sum())
                 degrees += int(np.linalg.matrix_rank(balances[:, free])) if free.any() else 0
@@ -250,7 +247,6 @@ class Processes:
         """
         table, substances = self._table, self._table.substances
         assert substances is not None
-        balances = self._incidence[[kind is ProcessKind.TRANSIT for kind in self.kinds.values()]]
         sizes = substances.amounts.max(axis=3)
         stated, before = substances.deviations, substances.amounts
         deviations = np.where(before > 0, np.where(np.isnan(stated), UNCERTAIN * before, stated), 0.0)
@@ -258,15 +254,14 @@ class Processes:
         for r, region in enumerate(table.regions):
             for y, year in enumerate(table.years):
                 spread, measured = deviations[:, r, y], before[:, r, y]
-                closest = closest_amounts(measured, spread, self.flows[r, y], balances)
+                closest = closest_amounts(measured, spread, self.flows[r, y], self._balances)
                 if closest is None:
-                    place = f"{region}, {year}" if region else str(year)
                     fault = f"no amounts of {' and '.join(substances.names)} balance within the flows"
-                    raise CirlError(f"{table.name}: {place}: {fault}; state how uncertain they are")
+                    raise CirlError(f"{table.name}: {_place(region, year)}: {fault}; state how uncertain they are")
                 amounts[:, r, y] = closest
                 change = np.divide(closest - measured, spread, out=np.zeros_like(closest), where=spread > 0)
                 chi_square += float((change**2).sum())
-                degrees += degrees_of_freedom(spread, balances)
+                degrees += degrees_of_freedom(spread, self._balances)
                 for e, k in np.argwhere(np.abs(closest - measured) > 1e-9 * sizes[:, r, y, None]).tolist():
                     cells = float(measured[e, k]), float(closest[e, k]), float(spread[e, k])
                     changes.append(Change(region, year, table.pairs[k], *cells, substances.names[e]))
@@ -292,9 +287,14 @@ class Processes:
         ends = np.maximum(sign * self._incidence, 0.0)
         return np.asarray(flows @ ends.T)
 
-    def _tolerance(self) -> Floats:
-        """Return what counts as rounding in each region, shape (regions,)."""
-        return np.asarray(ROUNDING * self.flows.max(axis=(1, 2)))
+
+def _rounding(flows: Floats) -> Floats:
+    """Return what counts as rounding in each region, shape (regions, 1, 1)."""
+    return np.asarray(ROUNDING * flows.max(axis=(1, 2), keepdims=True))
+
+
+def _place(region: str, year: int, substance: str = "") -> str:
+    return ", ".join(filter(None, (region, str(year), substance)))
 
 
 def _closest(table_flow: Floats, deviations: Floats, balances: Floats) -> Floats | None:

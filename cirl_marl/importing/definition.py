@@ -35,15 +35,17 @@ class ImportedFiles:
     arcs: Annotated[Mapping[Connection, str], "id of the arc of each pair"]
 
 
-def identifier(text: str) -> str:
+def identifier(text: str, kind: str = "process") -> str:
     """Return what a process is called in files: lower case, without accents, words joined by ``_``.
+
+    ``kind`` comes first where there is no letter to begin with.
 
     >>> identifier("Market of Ingots & semis")
     'market_of_ingots_semis'
     """
     plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode().lower()
     words = re.sub(r"[^a-z0-9]+", "_", plain).strip("_")
-    return words if words[:1].isalpha() else f"process_{words}".rstrip("_")
+    return words if words[:1].isalpha() else f"{kind}_{words}".rstrip("_")
 
 
 def identifiers(texts: Iterable[str]) -> dict[str, str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import shlex
 from collections.abc import Mapping, Sequence
 from datetime import date
@@ -15,6 +14,7 @@ import tomlkit
 
 from cirl_marl.definitions.data_files import DataFiles, number_in
 from cirl_marl.errors import CirlError, unknown_name
+from cirl_marl.importing.definition import identifier
 from cirl_marl.importing.process_estimates import (
     DIGITS,
     NOISE_KINDS,
@@ -132,7 +132,7 @@ def fit_disturbances(
     estimates: dict[str, Estimate] = {}
     noises = {}
     for column, entries in series.items():
-        name = _name(column)
+        name = identifier(column, "series")
         if name in estimates:
             raise CirlError(f"{path.name}: two columns would give a disturbance called '{name}'")
         try:
@@ -201,12 +201,6 @@ def _length_in_rows(interval: str, spacing: float, unit: str) -> float:
     if not 0 < rows < math.inf:
         raise CirlError(f"interval '{interval}': write a number and a unit of time, such as '0.25 day'")
     return rows
-
-
-def _name(column: str) -> str:
-    """Return what the disturbance of a column is called."""
-    words = re.sub(r"[^a-z0-9]+", "_", column.lower()).strip("_")
-    return words if words[:1].isalpha() else f"series_{words}"
 
 
 def _error_text(error: float | tuple[float, ...]) -> str:

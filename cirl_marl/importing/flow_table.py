@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from operator import itemgetter
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 from cirl_marl.definitions.data_files import no_collection, number_in
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.importing.grids import Grid, GridPart, Memo, is_year, read_grids
-from cirl_marl.importing.substance_flows import SubstanceFlows, SubstanceRows
+from cirl_marl.importing.substance_flows import SubstanceFlows, SubstanceRows, amount_scale
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.units import factor
@@ -240,21 +241,14 @@ def _part_of_stock(subject: str, value: float, text: str, unit: str, stock: floa
     Raises:
         CirlError: for a unit of neither.
     """
-    remedy = f"of a substance give a part, as in %, or an amount in {unit}"
     if not text:
-        raise CirlError(f"{subject}: no unit; {remedy}")
-    try:
-        part = value * factor(text, "1")
-    except CirlError:
-        try:
-            amount = value * factor(text, unit)
-        except CirlError as error:
-            raise CirlError(
-                f"{subject}: {error}; of a substance give a part, as in %, or an amount in {unit}"
-            ) from error
-        if amount and not stock:
-            raise CirlError(f"{subject}: {amount:g} {unit} of a stock of 0") from None
-        part = amount / stock if stock else 0.0
+        raise CirlError(f"{subject}: no unit; of a substance give a part, as in %, or an amount in {unit}")
+    scale, is_part = amount_scale(subject, text, unit)
+    part = value * scale
+    if not is_part:
+        if part and not stock:
+            raise CirlError(f"{subject}: {part:g} {unit} of a stock of 0")
+        part = part / stock if stock else 0.0
     return min(part, 1.0) if part <= 1 + ROUNDING else part
 
 
@@ -399,20 +393,14 @@ def _unit(path: Path, units: Mapping[str, str], default_unit: str | None) -> str
     if not stated_units and default_unit is None:
         raise CirlError(f"{path}: states no unit; give one with --unit, such as kt/year")
     unit = stated_units[0] if stated_units else str(default_unit)
-    try:
+    with suppress(CirlError):
         factor(unit, "kg/year")
         return unit
-    except CirlError:
-        # yearly masses are flows
-        _factor(str(path), unit, "kg")
-        return f"{unit}/year"
-
-
-def _factor(place: str, unit: str, target: str) -> float:
     try:
-        return factor(unit, target)
+        factor(unit, "kg")
+        return f"{unit}/year"  # yearly masses are flows
     except CirlError as error:
-        raise CirlError(f"{place}: {error}") from error
+        raise CirlError(f"{path}: {error}") from error
 
 
 def _check_years(table: FlowTable) -> None:

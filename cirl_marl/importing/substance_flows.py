@@ -108,18 +108,14 @@ def _cell(grid: Floats, place: tuple[int, ...]) -> float:
 
 
 def amount_scale(subject: str, text: str, unit: str) -> tuple[float, bool]:
-    """Return by what an amount in a unit is multiplied, and whether it is a part of the flow."""
-    try:
-        return factor(text, "1"), True
-    except CirlError:
-        yearly = unit.rpartition("/")[0]
+    """Return by what an amount in a unit is multiplied, and whether it is a part of the whole, in ``unit``."""
     faults = []
-    for target in (unit, yearly):
+    for target in ("1", unit, unit.removesuffix("/year")):
         try:
-            return factor(text, target), False
+            return factor(text, target), target == "1"
         except CirlError as error:
             faults.append(error)
-    raise CirlError(f"{subject}: {faults[0]}; of a substance give a part, as in % or ppm, or an amount in {unit}")
+    raise CirlError(f"{subject}: {faults[1]}; of a substance give a part, as in % or ppm, or an amount in {unit}")
 
 
 def mixed_amounts(amounts: Floats, flow: Floats, incidence: Floats, silent: Integers) -> Floats:
