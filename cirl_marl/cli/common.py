@@ -36,7 +36,7 @@ REWARDS = "local, circularity, mixed, difference, mixed_difference, local_sum, t
 LINE_SECONDS = 30.0
 """Between two lines of progress without a terminal."""
 OBSERVE = "local, neighbours, full, stocks, model"
-Value = TypeVar("Value")
+T = TypeVar("T")
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -86,6 +86,9 @@ EpisodeCount = Annotated[int, typer.Option(min=2, help="Fresh episodes to evalua
 EpisodesOfRun = Annotated[
     int | None, typer.Option(min=2, help="Fresh episodes; default: 64, or of a disturbed network 256 to 1024.")
 ]
+CheckpointEvery = Annotated[
+    float | None, typer.Option(min=0, help="Seconds between checkpoints; 0: none by time.", show_default="60")
+]
 Uncertain = Annotated[
     bool | None,
     typer.Option("--uncertain/--certain", help="Whether every episode draws the uncertain numbers of the network."),
@@ -105,15 +108,13 @@ Html = Annotated[
 ]
 
 
-def values_by_name(
-    entries: Sequence[str] | None, option: str, form: str, read: Callable[[str], Value]
-) -> dict[str, Value]:
+def values_by_name(entries: Sequence[str] | None, option: str, form: str, read: Callable[[str], T]) -> dict[str, T]:
     """Read NAME=VALUE of each entry of a repeatable option; ``read`` raises a ``ValueError`` for what is no value.
 
     Raises:
         CirlError: naming the option, the entry, and the ``form`` that it needs.
     """
-    values: dict[str, Value] = {}
+    values: dict[str, T] = {}
     for entry in entries or ():
         name, equals, text = (part.strip() for part in entry.partition("="))
         if name in values:

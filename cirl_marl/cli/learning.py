@@ -16,6 +16,8 @@ EVALUATION_SHARE = 0.6
 """Share of the evaluation in the work on a page; the rest is to plan."""
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from cirl_marl.evaluation.assessment import Evaluation
     from cirl_marl.paper.results import PaperRow, Results
 
@@ -63,9 +65,7 @@ def train(
     resume: Annotated[
         Path | None, typer.Option(metavar="RUN", help="Go on with an interrupted run; with --steps, to so many.")
     ] = None,
-    checkpoint_every: Annotated[
-        float | None, typer.Option(min=0, help="Seconds between checkpoints; 0: none by time.", show_default="60")
-    ] = None,
+    checkpoint_every: common.CheckpointEvery = None,
     episodes: common.EpisodesOfRun = None,
 ) -> None:
     """Train one learner per compartment, all at once, then evaluate them and draw what changed.
@@ -126,14 +126,9 @@ def evaluate(run: common.RunPath, episodes: common.EpisodesOfRun = None, seed: c
 
     with common.shares() as progress:
         evaluation = assessment.evaluate(run, episodes=episodes, seed=seed, progress=progress)
-    figures = evaluation.figures
-    _write_figures(evaluation)
-    _print_tables(evaluation)
-    common.console.print(local_returns_table(figures))
-    common.say(assessment.acting_checkpoint(evaluation.run))
-    _say_lacking(evaluation)
-    if "no_bound" in figures:
-        common.say(f"gap to bound: {figures['no_bound']}")
+    _keep_and_say(evaluation, local_returns_table(evaluation.figures))
+    if "no_bound" in evaluation.figures:
+        common.say(f"gap to bound: {evaluation.figures['no_bound']}")
 
 
 @common.app.command(rich_help_panel=common.LEARNERS)
@@ -258,30 +253,26 @@ def what_is_kept(directory: Path) -> str:
     return f"what was learnt in the first {status['joint_steps'] * run.config.envs:,} steps is saved. {go_on}"
 
 
-def _write_figures(evaluation: Evaluation) -> None:
-    """Keep the figures in the run, or say why they cannot be kept there."""
+def _keep_and_say(evaluation: Evaluation, *tables: Table) -> None:
+    """Keep the figures in the run, if they can be, and say them, who acts, and under which control what fell short."""
+    from cirl_marl.controllers.outcome import shortage_lines
+    from cirl_marl.evaluation.assessment import acting_checkpoint
+    from cirl_marl.report.terminal import evaluation_table
+    from cirl_marl.report.tradeoffs import worst_table
+
     try:
         evaluation.write()
     except OSError as error:
         common.say(f"evaluation.json could not be written: {error}")
-
-
-def _say_lacking(evaluation: Evaluation) -> None:
-    """Say under which control flows and services were less than was asked for, as means over the episodes."""
-    from cirl_marl.controllers.outcome import shortage_lines
-
-    for name, rollout in evaluation.rollouts.items():
-        for line in shortage_lines(evaluation.env.network, rollout):
-            common.say(f"{name}: {line}")
-
-
-def _print_tables(evaluation: Evaluation) -> None:
-    from cirl_marl.report.terminal import evaluation_table
-    from cirl_marl.report.tradeoffs import worst_table
-
     common.console.print(evaluation_table(evaluation.figures))
     if evaluation.comparison.network.disturbed:
         common.console.print(worst_table(evaluation.comparison))
+    for table in tables:
+        common.console.print(table)
+    common.say(acting_checkpoint(evaluation.run))
+    for name, rollout in evaluation.rollouts.items():
+        for line in shortage_lines(evaluation.env.network, rollout):
+            common.say(f"{name}: {line}")
 
 
 def evaluate_and_draw(directory: Path, episodes: int | None, seed: int, page: Path | None = None) -> None:
@@ -301,10 +292,7 @@ def evaluate_and_draw(directory: Path, episodes: int | None, seed: int, page: Pa
             progress=lambda activity, part: progress(activity, share * part),
         )
         story = None if page is None else page_of_evaluation(evaluation, part_of(progress, PLAN, share, 1 - share))
-    _write_figures(evaluation)
-    _print_tables(evaluation)
-    common.say(assessment.acting_checkpoint(evaluation.run))
-    _say_lacking(evaluation)
+    _keep_and_say(evaluation)
     for path in draw_run(evaluation):
         common.say(f"picture: {path}")
     if page is not None and story is not None:

@@ -16,7 +16,16 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
-from cirl_marl.cli.common import COMPARISONS, app, console, end_with, errors, folder_for, values_by_name
+from cirl_marl.cli.common import (
+    COMPARISONS,
+    CheckpointEvery,
+    app,
+    console,
+    end_with,
+    errors,
+    folder_for,
+    values_by_name,
+)
 from cirl_marl.jobs import PLACES
 
 if TYPE_CHECKING:
@@ -39,9 +48,7 @@ def sweep(
         list[str] | None,
         typer.Option(metavar="NAME=VALUE", help="Of sbatch, such as partition=long or timeout_min=600; repeatable."),
     ] = None,
-    checkpoint_every: Annotated[
-        float | None, typer.Option(min=0, help="Seconds between checkpoints; 0: none by time.", show_default="60")
-    ] = None,
+    checkpoint_every: CheckpointEvery = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the results as JSON; all else goes to stderr.")
     ] = False,

@@ -116,12 +116,12 @@ def publish_folder(folder: Path) -> Iterator[Path]:
             folder.rmdir()
 
 
-Rows = Iterable[Sequence[object]]
+TableRows = Iterable[Sequence[object]]
 
 
 def publish_result(
     folder: Path,
-    tables: Mapping[str, tuple[Sequence[str], Rows]],
+    tables: Mapping[str, tuple[Sequence[str], TableRows]],
     pictures: Mapping[str, Callable[[Path], object]],
     records: Mapping[str, object] = MappingProxyType({}),
 ) -> list[Path]:
@@ -139,7 +139,7 @@ def publish_result(
     return [folder / name for name in (*tables, *records, *pictures)]
 
 
-def write_table(path: Path, header: Sequence[str], rows: Rows) -> Path:
+def write_table(path: Path, header: Sequence[str], rows: TableRows) -> Path:
     """Write a CSV file atomically and return its path; None becomes an empty cell, and missing folders are made."""
 
     def write(temporary: Path) -> None:
