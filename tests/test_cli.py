@@ -21,7 +21,7 @@ from pages import shown
 from some import some
 
 import cirl_marl
-from cirl_marl import MultiAgentVectorEnv
+from cirl_marl import MultiAgentVectorEnv, cli
 from cirl_marl.cli import demonstration
 from cirl_marl.controllers.rollout import episode_start, first_seed
 from cirl_marl.definitions.catalogue import folder
@@ -215,6 +215,16 @@ def test_demo_stopped_says_what_is_kept(monkeypatch: pytest.MonkeyPatch, capsys:
 
 
 @pytest.mark.medium
+def test_ctrl_c_before_a_command_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ends it with 130, and without a traceback."""
+
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "app", interrupted)
+    assert run(monkeypatch, "networks") == 130
+
+
 def test_plan_and_compare(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """A controller's plan has units in its columns; a comparison without runs writes its four files."""
     asked = ("--control", "neutral", "--out", "plan.csv", "--html", "plan.html")

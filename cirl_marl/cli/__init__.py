@@ -33,3 +33,5 @@ def main() -> None:
     except LearnerError as error:
         errors.print(f"[bold red]training failed:[/] {plain(error)}", highlight=False, soft_wrap=True)
         sys.exit(1)
+    except KeyboardInterrupt:  # before a command has begun, which else says what is kept
+        sys.exit(130)

@@ -141,7 +141,7 @@ def import_flows(
     )
     definition = writer.files()
     changes = () if reconciliation is None else reconciliation.changes
-    with publish_folder(out.parent) as partial:
+    with publish_folder(out.parent, last=out.name) as partial:
         files = _write(partial, out.name, name, definition, changes)
         try:
             error, content_error = _largest_errors(partial / out.name, table, processes, contents, definition, progress)

@@ -40,6 +40,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import RunError, unknown_name
 from cirl_marl.learners.recipe import OPTIONS, Group, Recipe, Settings
 from cirl_marl.network import Network
+from cirl_marl.records.files import PARTIAL as PARTIAL_FILE
 from cirl_marl.records.files import (
     read_content,
     read_record,
@@ -54,7 +55,7 @@ from cirl_marl.records.machine import versions
 STATES = ("running", "complete", "interrupted", "failed")
 CHECKPOINT = re.compile(r"\d{9,}-(start|running|interrupted|complete|best|failed)")
 """Names of checkpoints."""
-BEFORE_CONFIG = re.compile(r"network(\.toml)?|(versions|status)\.json|\.(versions|status|config)\.partial\.json|\.lock")
+BEFORE_CONFIG = re.compile(rf"network(\.toml)?|(versions|status)\.json|{PARTIAL_FILE.pattern}\.json|\.lock")
 """What is in the directory of a run before its description is."""
 PARTIAL = "next.partial"
 """Folder of a checkpoint that is being written."""
@@ -144,7 +145,7 @@ class RunDirectory:
         if self.path.is_symlink() or not self.path.is_dir():
             return False
         names = {entry.name for entry in self.path.iterdir()}
-        is_ours = not names.isdisjoint({"versions.json", ".versions.partial.json"})
+        is_ours = any(name == "versions.json" or PARTIAL_FILE.match(name) for name in names)
         return is_ours and all(map(BEFORE_CONFIG.fullmatch, names))
 
     @contextmanager

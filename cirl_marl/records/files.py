@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import itertools
 import json
 import os
+import platform
+import re
 import shutil
-import tempfile
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,17 +21,45 @@ from cirl_marl.errors import RunError
 
 LARGEST = 200_000_000
 """Bytes of the largest file that is read as a whole."""
+PARTIAL = re.compile(r"\.partial-(?P<machine>[0-9a-f]{8})-(?P<process>\d+)-\d+")
+"""Stem of a file or folder that is being written: on which machine, and by which process."""
+_count = itertools.count()
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Let ``write`` fill a temporary file, then put it in the place of ``path`` in one step."""
-    temporary = path.with_name(f".{path.stem}.partial{path.suffix}")
+    temporary = _partial(path.parent, path.suffix)
     try:
         write(temporary)
         sync(temporary)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _partial(folder: Path, suffix: str = "") -> Path:
+    """Return a name that nobody else writes to, and remove what killed processes of this machine left behind."""
+    machine = f"{zlib.crc32(platform.node().encode()):08x}"
+    for path in folder.glob(".partial-*"):
+        match = PARTIAL.match(path.name)
+        if match and match["machine"] == machine and not _is_running(int(match["process"])):
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
+    return folder / f".partial-{machine}-{os.getpid()}-{next(_count)}{suffix}"
+
+
+def _is_running(process: int) -> bool:
+    if os.name == "nt":
+        return True  # where signal 0 is Ctrl-C
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        pass
+    return True
 
 
 def sync(path: Path) -> None:
@@ -101,14 +132,18 @@ def refuse_links(folder: Path) -> None:
 
 
 @contextmanager
-def publish_folder(folder: Path) -> Iterator[Path]:
-    """Yield an empty folder; its files move to ``folder`` if all goes well, and are forgotten if not."""
+def publish_folder(folder: Path, last: str = "") -> Iterator[Path]:
+    """Yield an empty folder; its files move to ``folder`` if all goes well, and are forgotten if not.
+
+    The one called ``last``, which names the others, moves last.
+    """
     is_new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(dir=folder, prefix=".partial-"))
+    partial = _partial(folder)
+    partial.mkdir()
     try:
         yield partial
-        for file in sorted(partial.iterdir()):
+        for file in sorted(partial.iterdir(), key=lambda file: (file.name == last, file.name)):
             os.replace(file, folder / file.name)
     finally:
         shutil.rmtree(partial)
