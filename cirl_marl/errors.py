@@ -10,6 +10,8 @@ from typing import Any
 
 LONGEST_LINE = 1200
 """Characters of a line of a message; of a longer one, which repeats what is in a file, the middle is left out."""
+MOST_LINES = 10
+"""Most faults of one kind that a message lists."""
 
 
 class CirlError(ValueError):
@@ -31,6 +33,15 @@ def _shorten(line: str) -> str:
     cut = f" … ({len(line)} characters in all) … "
     end = (LONGEST_LINE - len(cut)) // 2
     return line[:end] + cut + line[-end:]
+
+
+def first_lines(lines: Sequence[str]) -> list[str]:
+    """Return the first lines, at most ``MOST_LINES``, and a last one that says how many more there are.
+
+    >>> first_lines([str(number) for number in range(12)])[-2:]
+    ['9', 'and 2 more']
+    """
+    return [*lines[:MOST_LINES], *([f"and {len(lines) - MOST_LINES} more"] if len(lines) > MOST_LINES else [])]
 
 
 class NetworkError(CirlError):

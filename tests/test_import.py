@@ -24,7 +24,7 @@ from cirl_marl.controllers.rollout import episode_start
 from cirl_marl.importing.assembly import ImportReport, import_flows
 from cirl_marl.importing.balances import Processes, ProcessKind, _closest
 from cirl_marl.importing.definition import identifiers, shares_of
-from cirl_marl.importing.flow_table import Connection, FlowTable, read_flows
+from cirl_marl.importing.flow_table import Connection, FlowTable, read_flows, read_stocks
 from cirl_marl.network.elements import Role
 
 Row = Sequence[object]
@@ -206,7 +206,7 @@ def test_stocks_are_where_a_store_begins(tmp_path: Path) -> None:
     network = load_network(tmp_path / "metal.toml")
     assert network.initial[:, network.node_index["use"]] == pytest.approx([50.0, 50.0])
     rows[0][2] = 0.5
-    stocks = table(tmp_path / "few.csv", rows, ["process", "year", "value", "unit"])
+    stocks = table(tmp_path / "few_table.csv", rows, ["process", "year", "value", "unit"])
     message = r"does not give back 'Old scrap' to 'Smelter' in 2000: .* a store may run empty"
     with pytest.raises(CirlError, match=message):
         import_flows(flows, tmp_path / "few.toml", stocks, roles=ROLES)
@@ -278,7 +278,7 @@ def test_reconciled_flows_are_the_closest_that_balance(seed: int, tmp_path: Path
     assert len(changed) == len(found.changes) > 0
     listed = (tmp_path / "metal_changes.csv").read_text(encoding="utf-8").splitlines()[1:]
     assert len(listed) == len(changed)
-    exact = table(tmp_path / "exact.csv", cycle())
+    exact = table(tmp_path / "exact_table.csv", cycle())
     assert import_flows(exact, tmp_path / "exact.toml", roles=ROLES, reconcile=True).changes == ()
 
 
@@ -368,6 +368,12 @@ def two_regions(missing: int) -> list[list[object]]:
         ),
         (cycle(), {"sheet": "2001"}, "flows.csv: is no workbook, so that it has no sheet '2001'"),
         ([], {}, "flows.csv: has no flows"),
+        (bad(target="SMELTER"), {}, "flows.csv: 'Smelter' and 'SMELTER' differ in case alone; write them alike"),
+        (bad(region="Japan"), {}, "flows.csv, line 2: states no region, as others do"),
+        (bad(value="1e51"), {}, "line 4, column 'value': 1e51 must be 0, or between 1e-50 and 1e+50 in size"),
+        (cycle(), {"year": 2000}, "--year 2000: flows.csv has a column of years; leave out one of them"),
+        (cycle(), {"year": 0}, "--year 0: is no year from 1 to 9999"),
+        (cycle(), {"unit": "t/year"}, "--unit t/year: 'kt/year' stands in flows.csv, line 2; leave out one of them"),
     ],
 )
 def test_bad_tables_are_refused(rows: list[list[object]], options: dict[str, Any], said: str, tmp_path: Path) -> None:
@@ -404,6 +410,124 @@ def test_bad_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(CirlError, match=r"exists, and may have been changed by hand"):
         import_flows(flows, tmp_path / "metal.toml", roles=ROLES)
     assert (tmp_path / "metal.toml").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("source;target;year;value;unit\nOre;Works;2000;1,5;t/year\n".encode("cp1252"), "separated by ';'; save it"),
+        (b"source\ttarget\tyear\tvalue\tunit\n", r"separated by '\t'; save it"),
+        ("source,target,year,value,unit\n".encode("utf-16-le"), "it has zero bytes, as UTF-16 has; save it in UTF-8"),
+        ("source,target,year,value,unit\nErzkörper,W".encode("cp1252"), "save it in UTF-8"),
+        (b"sorce,target,year,value,unit\n", "needs a column 'source'; it has sorce, target, year, value, unit"),
+        (b"source,target,value,unit\n", "needs a column 'year', or --year; it has source, target, value, unit"),
+    ],
+)
+def test_files_of_other_programs(content: bytes, said: str, tmp_path: Path) -> None:
+    """What spreadsheet programs save elsewhere is told apart from tables whose columns are wrong."""
+    (tmp_path / "flows.csv").write_bytes(content)
+    with pytest.raises(CirlError) as refused:
+        read_flows(tmp_path / "flows.csv")
+    assert said in str(refused.value)
+
+
+FAULTS: dict[str, Callable[[list[object]], list[object]]] = {
+    "is no number": lambda row: [*row[:5], "n/a", row[6]],
+    "is negative": lambda row: [*row[:5], -1, row[6]],
+    "is no whole year": lambda row: [*row[:4], "?", *row[5:]],
+    "a flow needs a source and a target": lambda row: [row[0], " ", *row[2:]],
+    "3 cells in 7 columns": lambda row: row[:3],
+    "stands in line": lambda row: row,
+}
+"""What can be wrong with a row, and what makes it so of a good one."""
+
+
+@settings(max_examples=20)
+@given(st.dictionaries(st.integers(0, 35), st.sampled_from([*FAULTS])), st.booleans())
+def test_every_bad_row_is_named(
+    tmp_path_factory: pytest.TempPathFactory, faults: dict[int, str], has_repetitions: bool
+) -> None:
+    """At once, in the order of the lines: the first ten, and how many more; repetitions, if all can be read."""
+    kinds = [kind for kind in FAULTS if (kind == "stands in line") == has_repetitions]
+    faults = {i: kind for i, kind in faults.items() if kind in kinds}
+    rows = cycle(years=4)
+    for i, kind in faults.items():
+        rows = [*rows, rows[i]] if has_repetitions else [*rows[:i], FAULTS[kind](rows[i]), *rows[i + 1 :]]
+    path = table(tmp_path_factory.mktemp("faults") / "flows.csv", rows)
+    if not faults:
+        assert len(read_flows(path).values) == len(rows)
+        return
+    with pytest.raises(CirlError) as refused:
+        read_flows(path)
+    *named, last = str(refused.value).split("\n")
+    if len(faults) > 10:
+        assert last == f"and {len(faults) - 10} more"
+    else:
+        named.append(last)
+    lines = range(len(cycle(years=4)) + 2, len(rows) + 2) if has_repetitions else [i + 2 for i in sorted(faults)]
+    kinds_of_lines = [kind for _, kind in sorted(faults.items())]
+    assert len(named) == min(10, len(faults))
+    for text, line, kind in zip(named, lines, kinds_of_lines, strict=False):
+        assert text.startswith(f"flows.csv, line {line}") and kind in text
+
+
+def test_reading_ends_where_nothing_is_right(tmp_path: Path) -> None:
+    """After so many bad rows the rest is not looked at."""
+    rows = [[*row[:5], "x", row[6]] for row in cycle(years=200)]
+    with pytest.raises(CirlError) as refused:
+        read_flows(table(tmp_path / "flows.csv", rows))
+    assert str(refused.value).endswith("and 990 more")
+
+
+def test_all_bad_rows_of_stocks_and_substances_are_named(tmp_path: Path) -> None:
+    """As those of flows are."""
+    rows = [["Use", y, "Cu", "3", "kt"] for y in ("1999", "2000")] + [["Use", "1999", "", "-1", "kt"]]
+    path = table(tmp_path / "stocks.csv", rows, ["process", "year", "substance", "value", "unit"])
+    with pytest.raises(CirlError) as refused:
+        read_stocks(path, "kt")
+    assert str(refused.value) == "stocks.csv, line 4, column 'value': -1 is negative"
+    table(path, [*rows[:2], ["Use", "1999", "", "1", "kt"]], ["process", "year", "substance", "value", "unit"])
+    with pytest.raises(CirlError) as refused:
+        read_stocks(path, "kt")
+    first, second = str(refused.value).split("\n")
+    assert "line 2: 3 of 'Use' is Cu" in first and "line 3: no row says what 'Use' holds in 2000" in second
+    flows = [["Ore", "Works", 2000, 1, "kt/year", ""], *[["Ore", "Elsewhere", 2000, 1, "%", e] for e in ("Cu", "Fe")]]
+    path = table(tmp_path / "flows.csv", flows, ["source", "target", "year", "value", "unit", "substance"])
+    with pytest.raises(CirlError) as refused:
+        read_flows(path)
+    assert [line.split(":")[0] for line in str(refused.value).split("\n")] == [
+        "flows.csv, line 3",
+        "flows.csv, line 4",
+    ]
+
+
+def test_names_that_look_alike_are_alike(tmp_path: Path) -> None:
+    """Letters with accents in two forms, odd and doubled spaces, in tables and in options."""
+    rows = [
+        ["Ore", "Schmo\u0308lze\u00a0 A", "", "", 2000, 1, "t/year"],
+        ["Schmölze A", "Dump", "", "", 2000, 1, "t/year"],
+    ]
+    found = import_flows(
+        table(tmp_path / "flows.csv", rows), tmp_path / "net.toml", roles=ROLES, stores=["Schmo\u0308lze A"]
+    )
+    assert found.processes.of(ProcessKind.STORE) == ("Schmölze A",)
+
+
+@pytest.mark.parametrize("text", ["two\nlines = 1", "a\x7fb", 'quo"te\\', "\x00"])
+def test_any_title_can_be_written(text: str, tmp_path: Path) -> None:
+    """Whatever characters it has, it is a title and no more."""
+    import_flows(table(tmp_path / "flows.csv", cycle()), tmp_path / "metal.toml", roles=ROLES, title=text)
+    assert load_network(tmp_path / "metal.toml").title == text
+
+
+@pytest.mark.parametrize("name", ["metal.csv", "metal_changes.csv", "metal_regions.csv"])
+def test_nothing_is_written_over(name: str, tmp_path: Path) -> None:
+    """A table that is imported keeps its numbers, though the data of the network would be called like it."""
+    path = table(tmp_path / name, cycle())
+    content = path.read_bytes()
+    with pytest.raises(CirlError, match=rf"metal.toml: {name} exists, and may have been changed by hand"):
+        import_flows(path, tmp_path / "metal.toml", roles=ROLES)
+    assert path.read_bytes() == content and [*tmp_path.iterdir()] == [path]
 
 
 def test_the_command_imports(tmp_path: Path) -> None:

@@ -481,14 +481,14 @@ def test_traces_are_separated_and_balance_as_what_there_is_most_of(tmp_path: Pat
     rows = [*sorting()[:1], ["Mine", "Dump", 2000, "", 10, "kt/year", ""]]
     rows[0][1] = "Product"
     rows += [["Mine", "Dump", 2000, "Copper", 0.09, "ppm", ""], ["Mine", "Product", 2000, "Copper", 0, "ppm", ""]]
-    import_flows(table(tmp_path / "source.csv", rows), tmp_path / "source.toml", roles=ROLES)
+    import_flows(table(tmp_path / "source_table.csv", rows), tmp_path / "source.toml", roles=ROLES)
     contents = contents_of(tmp_path / "source.toml")
     assert contents["mine_to_dump"] == pytest.approx(9e-8) and contents["mine_to_product"] == 0.0
     exact = [*sorting()[:3], *([*row[:6], "0"] for row in sorting((2e-6, 0, 0))[3:])]
     with pytest.raises(CirlError, match="no amounts of Copper balance"):
-        import_flows(table(tmp_path / "exact.csv", exact), tmp_path / "exact.toml", roles=ROLES, reconcile=True)
+        import_flows(table(tmp_path / "exact_table.csv", exact), tmp_path / "exact.toml", roles=ROLES, reconcile=True)
     trace = [[*row[:3], "Tin", row[4] * 1e-9, *row[5:]] for row in sorting((5, 1, 3))[3:]]  # type: ignore[operator]
-    both = table(tmp_path / "both.csv", [*sorting(), *trace])
+    both = table(tmp_path / "both_table.csv", [*sorting(), *trace])
     report = import_flows(both, tmp_path / "both.toml", roles=ROLES, reconcile=True)
     assert report.table.substances is not None
     ore, product, dump = report.table.substances.amounts[1, 0, 0]
@@ -511,7 +511,7 @@ def test_flows_of_a_day_are_those_of_a_year(tmp_path: Path) -> None:
     assert report.table.unit == "kt/year" and report.table.values == pytest.approx([365.25])
     assert report.table.deviations == pytest.approx([36.525])
     assert contents_of(tmp_path / "net.toml") == {"mine_to_dump": pytest.approx(0.04)}
-    bare = table(tmp_path / "bare.csv", [[*row[:5], "", row[6]] for row in rows])
+    bare = table(tmp_path / "bare_table.csv", [[*row[:5], "", row[6]] for row in rows])
     import_flows(bare, tmp_path / "bare.toml", roles=ROLES, unit="kt/day")
     assert contents_of(tmp_path / "bare.toml") == {"mine_to_dump": pytest.approx(0.04)}
 
@@ -540,7 +540,7 @@ def test_regions_and_years_tell_for_themselves(tmp_path: Path) -> None:
     assert alone.table.substances is None
     later = [[*row[:2], 2001, *row[3:]] for row in sorting()[:3]]
     with pytest.raises(CirlError, match=r"no row says what there is of Copper in 2001; say it, if only that it is 0"):
-        import_flows(table(tmp_path / "years.csv", [*sorting(), *later]), tmp_path / "years.toml", roles=ROLES)
+        import_flows(table(tmp_path / "years_table.csv", [*sorting(), *later]), tmp_path / "years.toml", roles=ROLES)
 
 
 def test_nothing_flows_with_a_content(tmp_path: Path) -> None:
@@ -621,7 +621,8 @@ def test_contents_of_stocks_are_held_against_the_simulation(tmp_path: Path, cont
     stocks: list[Row] = [["Use", year, "", 100, "kt"] for year in (1990, 1999, 2000)]
     stocks += [["Use", 1999, "Copper", 5, "%"], ["Use", 2000, "Copper", content, "1"]]
     assert stored(tmp_path, stocks, dumped=0.4).content_error == pytest.approx(abs(5.6 / 102 - content), abs=3e-4)
-    (tmp_path / "net.toml").unlink()
+    for path in tmp_path.glob("net.*"):
+        path.unlink()
     with pytest.raises(
         CirlError, match=r"0\.04 of 'Use' in 1990 is Copper, but contents .* the end of 1999, and ends .* 2000"
     ):

@@ -64,6 +64,8 @@ def csv_blocks(subject: str, content: bytes) -> Iterator[Block]:
 
 def _blocks(subject: str, content: bytes) -> Iterator[tuple[Sequence[int], Sequence[CsvRow]]]:
     """Yield the same rows, those of a file without quotes as the texts of their lines."""
+    if b"\0" in content:
+        raise CirlError(f"{subject}: is no CSV file in UTF-8: it has zero bytes, as UTF-16 has; save it in UTF-8")
     blocks: Iterator[tuple[Sequence[int], Sequence[CsvRow]]]
     blocks = _quoted_blocks(content) if b'"' in content else _plain_blocks(content)
     try:
@@ -73,7 +75,7 @@ def _blocks(subject: str, content: bytes) -> Iterator[tuple[Sequence[int], Seque
                 rows = [row for row in rows if row]
             yield lines, rows
     except (UnicodeDecodeError, csv.Error) as error:
-        raise CirlError(f"{subject}: is no CSV file in UTF-8: {error}") from error
+        raise CirlError(f"{subject}: is no CSV file in UTF-8: {error}; save it in UTF-8") from error
 
 
 def _plain_blocks(content: bytes) -> Iterator[tuple[Sequence[int], Sequence[CsvRow]]]:

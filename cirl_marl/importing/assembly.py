@@ -13,17 +13,18 @@ from cirl_marl.controllers.basic import Neutral
 from cirl_marl.controllers.rollout import Rollout, episode_start
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, unknown_name
+from cirl_marl.errors import CirlError, first_lines, unknown_name
 from cirl_marl.importing.balances import Change, Processes, ProcessKind, Reconciliation, Residual
 from cirl_marl.importing.definition import DefinitionWriter, ImportedFiles, identifiers
 from cirl_marl.importing.flow_table import FlowTable, StockKey, read_flows, read_stocks
+from cirl_marl.importing.grids import plain_text
 from cirl_marl.network import Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Role
 from cirl_marl.records.files import publish_folder, write_table
 
-MOST_LINES = 10
-"""Most residuals that a message lists."""
+TABLES = ("", "_regions", "_changes")
+"""What the names of tables beside a definition end with."""
 NOTICEABLE = 1e-6
 """Part of the largest flow of a region below which the content of a flow does not count."""
 WRONG = 1e-5
@@ -96,8 +97,13 @@ def import_flows(
     flows, out, stocks = Path(flows), Path(out), None if stocks is None else Path(stocks)
     if out.suffix != ".toml":
         raise CirlError(f"--out {out}: needs the name of a .toml file")
-    if out.exists():
-        raise CirlError(f"--out {out}: exists, and may have been changed by hand; choose another name, or remove it")
+    name = identifiers([out.stem])[out.stem]
+    if name != out.stem:
+        raise CirlError(f"--out {out}: the name of a network has lower case letters, digits and _, as {name}.toml")
+    for path in (out, *(out.with_name(f"{name}{end}.csv") for end in TABLES)):
+        if path.exists():  # the table of flows itself, perhaps
+            fault = f"{path.name} exists, and may have been changed by hand"
+            raise CirlError(f"--out {out}: {fault}; choose another name, or remove it")
     table = read_flows(flows, sheet=sheet, unit=unit, year=year)
     if regions:
         table = table.of(regions)
@@ -126,9 +132,6 @@ def import_flows(
         reconciliation = of_substances if reconciliation is None else reconciliation + of_substances
         processes = Processes(table, processes.of(ProcessKind.STORE))
     role_of = _roles(table, processes, roles, ask)
-    name = identifiers([out.stem])[out.stem]
-    if name != out.stem:
-        raise CirlError(f"--out {out}: the name of a network has lower case letters, digits and _, as {name}.toml")
     writer = DefinitionWriter(
         table=table,
         processes=processes,
@@ -177,7 +180,7 @@ def _matching_processes(table: FlowTable, patterns: Sequence[str], label: str) -
     """Return the processes that names or patterns stand for; a ``CirlError`` for one that stands for none."""
     names = list(dict.fromkeys(end for pair in table.pairs for end in (pair.source, pair.target)))
     processes: list[str] = []
-    for pattern in patterns:
+    for pattern in map(plain_text, patterns):
         matches = [name for name in names if fnmatchcase(name, pattern)]
         if not matches:
             raise CirlError(f"{table.name}: {label}: {unknown_name('process', pattern, names)}")
@@ -239,11 +242,11 @@ def _roles(
 def _imbalance_message(table: FlowTable, residuals: Sequence[Residual]) -> str:
     """Say what does not balance."""
     names = dict.fromkeys(residual.process for residual in residuals)
-    lines = [f"  {residual}" for residual in residuals[:MOST_LINES]]
-    more = [f"  and {len(residuals) - MOST_LINES} more"] if len(residuals) > MOST_LINES else []
+    lines = [f"  {line}" for line in first_lines(list(map(str, residuals)))]
     remedy = "Name those that hold a stock with --store, or adjust the flows with --reconcile"
-    headline = f"{table.name}: {len(names)} processes do not balance ({table.unit}); the largest residuals are"
-    return "\n".join([headline, *lines, *more, f"{remedy}; nothing was written."])
+    count = "1 process does" if len(names) == 1 else f"{len(names)} processes do"
+    headline = f"{table.name}: {count} not balance ({table.unit}); the largest residuals are"
+    return "\n".join([headline, *lines, f"{remedy}; nothing was written."])
 
 
 def _write(folder: Path, file: str, name: str, definition: ImportedFiles, changes: Sequence[Change]) -> list[str]:
@@ -255,13 +258,13 @@ def _write(folder: Path, file: str, name: str, definition: ImportedFiles, change
         [c.region, c.year, *c.pair, c.before, c.after, c.deviation, c.in_deviations, *[c.substance] * of_substances]
         for c in sorted(changes, key=lambda change: -abs(change.after - change.before))
     ]
-    tables: dict[str, list[list[object]]] = {
-        f"{name}.csv": definition.data,
-        f"{name}_regions.csv": definition.regions,
-        f"{name}_changes.csv": [[*header], *change_rows] if changes else [],
-    }
+    tables: list[list[list[object]]] = [
+        definition.data,
+        definition.regions,
+        [[*header], *change_rows] if changes else [],
+    ]
     (folder / file).write_text(definition.text, encoding="utf-8")
-    non_empty = {table: rows for table, rows in tables.items() if rows}
+    non_empty = {f"{name}{end}.csv": rows for end, rows in zip(TABLES, tables, strict=True) if rows}
     for table, rows in non_empty.items():
         write_table(folder / table, list(map(str, rows[0])), rows[1:])
     return [file, *non_empty]

@@ -198,7 +198,6 @@ class DefinitionWriter:
 
     def _head(self) -> Iterator[str]:
         years, unit, source = self.table.years, self.table.unit, _text(self.source)
-        yield f"# {self.title}"
         yield "# Made by cirl import, and yours to change: `cirl check` names mistakes."
         yield f"name = {_text(self.name)}"
         yield f"title = {_text(self.title + (' of {region}' if self._regional else ''))}"
@@ -370,7 +369,7 @@ class DefinitionWriter:
 
 
 def _text(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False)
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")  # which TOML does not have in texts
 
 
 def _short(value: float) -> str:

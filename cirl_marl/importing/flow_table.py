@@ -13,14 +13,16 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from cirl_marl.definitions.data_files import no_collection, number_in
-from cirl_marl.errors import CirlError, unknown_name
-from cirl_marl.importing.grids import Grid, GridPart, Memo, is_year, read_grids
+from cirl_marl.errors import CirlError, first_lines, unknown_name
+from cirl_marl.importing.grids import Grid, GridPart, Memo, is_year, plain_text, read_grids
 from cirl_marl.importing.substance_flows import SubstanceFlows, SubstanceRows, amount_scale
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.units import factor
 
 LAST_YEAR = 9999
+LONG = {"source", "target", "year", "value", "unit"}
+"""Columns of which a long table has most, should the name of one be misspelt."""
 ROUNDING = 1e-9
 """By how much a part of a stock may be more than 1, as amounts round."""
 
@@ -78,6 +80,7 @@ class FlowTable:
         Raises:
             CirlError: for one that is not there; names the nearest.
         """
+        regions = list(map(plain_text, regions))
         for region in regions:
             if region not in self.regions:
                 raise CirlError(f"{self.name}: {unknown_name('region', region, self.regions)}")
@@ -136,8 +139,10 @@ def _read_flows(path: Path, sheet: str | None, default_unit: str | None, default
     parts: list[_Entries] = []
     units: dict[str, str] = {}
     substances = SubstanceRows()
+    if default_year is not None and not 1 <= default_year <= LAST_YEAR:
+        raise CirlError(f"--year {default_year}: is no year from 1 to {LAST_YEAR}")
     for grid in read_grids(path, sheet):
-        long = {"source", "target"} <= grid.places.keys()
+        long = {"source", "target"} <= grid.places.keys() or len(LONG & grid.places.keys()) > 2
         of_grid = _long(grid, default_year, regions, pairs, substances) if long else None
         for entries in of_grid or _matrix(grid, default_year, regions, pairs):
             parts.append(entries)
@@ -154,6 +159,7 @@ def _read_flows(path: Path, sheet: str | None, default_unit: str | None, default
         np.concatenate([part.values for part in parts]),
         np.concatenate([part.deviations for part in parts]),
     )
+    _check_names(table, parts)
     _check_repetitions(table, parts)
     _check_years(table)
     unit = _unit(path, units, default_unit)
@@ -176,20 +182,36 @@ def _per_year(table: FlowTable) -> FlowTable:
 
 
 def _check_repetitions(table: FlowTable, parts: Sequence[_Entries]) -> None:
-    """Refuse a flow that stands in a table twice; a ``CirlError`` names the first."""
+    """Refuse flows that stand in a table twice; a ``CirlError`` names them."""
     region, year, pair = table.places
     numbers = (region * (LAST_YEAR + 1) + year) * len(table.pairs) + pair
     ordered = np.sort(numbers)
     if (ordered[1:] > ordered[:-1]).all():
         return
-    order = np.argsort(numbers, kind="stable")
-    later = int(order[1:][numbers[order[1:]] == numbers[order[:-1]]].min())
-    earlier = int(np.flatnonzero(numbers == numbers[later])[0])
-    positions = [(part.name, line) for part in parts for line in part.lines]
-    (name, line), first = positions[later], positions[earlier][1]
-    place = table.regions[region[later]]
-    flow = f"{table.pairs[pair[later]]} in {year[later]}{f' in {place}' if place else ''}"
-    raise CirlError(f"{name}, line {line}: {flow} stands in line {first} too; leave one out, or give them types")
+    _, first, place = np.unique(numbers, return_index=True, return_inverse=True)
+    positions, faults = _positions(parts), []
+    for later in np.flatnonzero(first[place] < np.arange(len(numbers))).tolist():
+        owner = table.regions[region[later]]
+        flow = f"{table.pairs[pair[later]]} in {year[later]}{f' in {owner}' if owner else ''}"
+        fault = f"{flow} stands in line {positions[first[place[later]]][1]} too; leave one out, or give them types"
+        faults.append("{}, line {}: {}".format(*positions[later], fault))
+    raise CirlError("\n".join(first_lines(faults)))
+
+
+def _positions(parts: Sequence[_Entries]) -> list[tuple[str, int]]:
+    """Return the sheet and the line of each flow."""
+    return [(part.name, line) for part in parts for line in part.lines]
+
+
+def _check_names(table: FlowTable, parts: Sequence[_Entries]) -> None:
+    """Refuse processes that differ in the case of letters alone, and rows that lack a region where others have one."""
+    names: dict[str, str] = {}
+    for name in (end for pair in table.pairs for end in (pair.source, pair.target)):
+        if (other := names.setdefault(name.casefold(), name)) != name:
+            raise CirlError(f"{table.name}: '{other}' and '{name}' differ in case alone; write them alike")
+    if "" in table.regions and len(table.regions) > 1:
+        first = int(np.flatnonzero(table.places[0] == table.regions.index(""))[0])
+        raise CirlError("{}, line {}: states no region, as others do".format(*_positions(parts)[first]))
 
 
 StockKey = tuple[str, str, int]
@@ -210,7 +232,7 @@ def read_stocks(path: Path, unit: str) -> tuple[dict[StockKey, float], dict[str,
     parts: list[GridPart] = []
     for grid in read_grids(path, None):
         grid.require(("process", "year", "value", "unit"))
-        factors = Memo[str, float](lambda text: factor(text.strip(), unit))
+        factors = Memo[str, float](lambda text: factor(text.strip(), unit), 1.0)
         for part in grid.parts():
             is_whole = [not name.strip() for name in part.of("substance")]
             parts.append(part.rows_in(np.logical_not(is_whole).tolist()))
@@ -218,48 +240,52 @@ def read_stocks(path: Path, unit: str) -> tuple[dict[StockKey, float], dict[str,
             scales = wholes.convert(wholes.of("unit"), factors)
             for (key, line, value), scale in zip(_stock_rows(wholes), scales, strict=True):
                 if key in stocks:
-                    raise CirlError(f"{grid.name}, line {line}: a stock of '{key[1]}' in {key[2]} stands there already")
+                    grid.note_fault(line, f"a stock of '{key[1]}' in {key[2]} stands there already")
                 stocks[key] = value * scale
     for part in parts:
         rows = zip(_stock_rows(part), part.of("substance"), part.of("unit"), strict=True)
         for (key, line, value), name, text in rows:
-            subject, content = f"{part.grid.name}, line {line}", contents.setdefault(name.strip(), {})
-            if key in content:
-                raise CirlError(f"{subject}: {name.strip()} of '{key[1]}' in {key[2]} stands there already")
-            if key not in stocks:
-                raise CirlError(f"{subject}: no row says what '{key[1]}' holds in {key[2]} in all; give it")
-            content[key] = _part_of_stock(subject, value, text.strip(), unit, stocks[key])
-            if not 0 <= content[key] <= 1:
-                fault = f"{content[key]:.4g} of '{key[1]}' is {name.strip()}"
-                raise CirlError(f"{subject}: {fault}; it must be in [0, 1], in all of {stocks[key]:g} {unit}")
+            content = contents.setdefault(plain_text(name), {})
+            try:
+                if key in content:
+                    raise CirlError(f"{plain_text(name)} of '{key[1]}' in {key[2]} stands there already")
+                if key not in stocks:
+                    raise CirlError(f"no row says what '{key[1]}' holds in {key[2]} in all; give it")
+                content[key] = _part_of_stock(value, text.strip(), unit, stocks[key])
+                if content[key] > 1:
+                    fault = f"{content[key]:.4g} of '{key[1]}' is {plain_text(name)}"
+                    raise CirlError(f"{fault}; it must be in [0, 1], in all of {stocks[key]:g} {unit}")
+            except CirlError as error:
+                part.grid.note_fault(line, str(error))
+        part.grid.check()
     return stocks, contents
 
 
-def _part_of_stock(subject: str, value: float, text: str, unit: str, stock: float) -> float:
+def _part_of_stock(value: float, text: str, unit: str, stock: float) -> float:
     """Return what part of a stock an amount of a substance is, or the part that is stated; 1 up to rounding is 1.
 
     Raises:
         CirlError: for a unit of neither.
     """
     if not text:
-        raise CirlError(f"{subject}: no unit; of a substance give a part, as in %, or an amount in {unit}")
-    scale, is_part = amount_scale(subject, text, unit)
+        raise CirlError(f"no unit; of a substance give a part, as in %, or an amount in {unit}")
+    scale, is_part = amount_scale(text, unit)
     part = value * scale
     if not is_part:
         if part and not stock:
-            raise CirlError(f"{subject}: {part:g} {unit} of a stock of 0")
+            raise CirlError(f"{part:g} {unit} of a stock of 0")
         part = part / stock if stock else 0.0
     return min(part, 1.0) if part <= 1 + ROUNDING else part
 
 
 def _stock_rows(part: GridPart) -> Iterator[tuple[StockKey, int, float]]:
     """Yield region, process and year of each row, its line and value."""
-    years = part.convert(part.of("year"), Memo(_year))
+    years = part.convert(part.of("year"), Memo(_year, 0))
     values = part.numbers(part.grid.places["value"], part.of("value")).tolist()
     for region, process, year, line, value in zip(
         part.of("region"), part.of("process"), years, part.lines, values, strict=True
     ):
-        yield (region.strip(), process.strip(), year), line, value
+        yield (plain_text(region), plain_text(process), year), line, value
 
 
 @positional_record
@@ -292,12 +318,15 @@ def _long(
             )
         grid.places["value"] = unit_columns[0]
         unit = grid.header[unit_columns[0]].strip().lower().replace("_per_", "/")
+    grid.require(("source", "target"))
     if default_year is None:
-        grid.require(("year",))
+        grid.require(("year",), ", or --year")
+    elif "year" in grid.places:
+        raise CirlError(f"--year {default_year}: {grid.name} has a column of years; leave out one of them")
     ends = itemgetter(*(grid.places[key] for key in ("source", "target", "type") if key in grid.places))
-    pair_numbers = Memo[tuple[str, ...], int](lambda cells: pairs.setdefault(_connection(cells), len(pairs)))
-    region_numbers = Memo[str, int](lambda text: regions.setdefault(text.strip(), len(regions)))
-    years = Memo(_year)
+    pair_numbers = Memo[tuple[str, ...], int](lambda cells: pairs.setdefault(_connection(cells), len(pairs)), 0)
+    region_numbers = Memo[str, int](lambda text: regions.setdefault(plain_text(text), len(regions)), 0)
+    years = Memo(_year, 0)
 
     def numbers(part: GridPart) -> tuple[Integers, Floats, Floats]:
         """Return places, values and deviations of rows."""
@@ -323,9 +352,9 @@ def _long(
 
 def _connection(cells: tuple[str, ...]) -> Connection:
     """Return the flow that the cells of a row name."""
-    pair = Connection(*map(str.strip, cells))
+    pair = Connection(*map(plain_text, cells))
     if not pair.source or not pair.target:
-        raise CirlError("a flow needs a source and a target")
+        raise CirlError("a flow needs a source and a target; of merged cells only the first has a text")
     if pair.source == pair.target:
         raise CirlError(f"{pair}: a flow needs two processes")
     return pair
@@ -357,19 +386,21 @@ def _matrix(
 ) -> Iterator[_Entries]:
     """Yield the flows of a matrix of processes, which state no unit and no deviation, and count pairs that are new."""
     sheet_name = grid.name.rpartition(", sheet '")[2].rstrip("'")
+    if is_year(sheet_name) and default_year is not None:
+        raise CirlError(f"--year {default_year}: {grid.name} is named by its year; leave --year out, or give --sheet")
     year = int(sheet_name) if is_year(sheet_name) else default_year
     if year is None:
         raise CirlError(
             f"{grid.name}: is a matrix of processes, as it has no columns 'source' and 'target'; of which year? Give "
             "--year, or name its sheet by it"
         )
-    targets = [title.strip() for title in grid.header[1:]]
+    targets = [plain_text(title) for title in grid.header[1:]]
     for target, count in Counter(targets).items():
         if not target or count > 1:
             problem = f"names '{target}' twice" if target else "has a column without a name"
             raise CirlError(f"{grid.name}, line 1: {problem}; each column is a process that receives")
     region = regions.setdefault("", len(regions))
-    pair_numbers = Memo[tuple[str, ...], int](lambda cells: pairs.setdefault(_connection(cells), len(pairs)))
+    pair_numbers = Memo[tuple[str, ...], int](lambda cells: pairs.setdefault(_connection(cells), len(pairs)), 0)
     for part in grid.parts():
         columns = [[row[k].strip() or "0" for row in part.rows] for k in range(1, len(grid.header))]
         numbers = np.array([part.numbers(k, texts) for k, texts in enumerate(columns, 1)]).reshape(len(columns), -1)
@@ -390,6 +421,9 @@ def _unit(path: Path, units: Mapping[str, str], default_unit: str | None) -> str
         raise CirlError(f"{units[second]}: unit '{second}', but '{first}' in {units[first]}; give all in one unit")
     if stated_units and "" in units:
         raise CirlError(f"{units['']}: states no unit, as others do; write '{stated_units[0]}' if that is it")
+    if stated_units and default_unit not in (None, stated_units[0]):
+        stated = f"'{stated_units[0]}' stands in {units[stated_units[0]]}"
+        raise CirlError(f"--unit {default_unit}: {stated}; leave out one of them")
     if not stated_units and default_unit is None:
         raise CirlError(f"{path}: states no unit; give one with --unit, such as kt/year")
     unit = stated_units[0] if stated_units else str(default_unit)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import unicodedata
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
@@ -12,10 +13,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from cirl_marl.definitions.data_files import Block, check_lengths, csv_blocks, number_in
-from cirl_marl.errors import CirlError, unknown_name
+from cirl_marl.definitions.data_files import Block, csv_blocks, number_in
+from cirl_marl.errors import CirlError, first_lines, unknown_name
 from cirl_marl.importing.workbooks import read_sheets
 from cirl_marl.network import Floats
+from cirl_marl.network.declarations import LARGEST, SMALLEST
 from cirl_marl.records.files import read_content
 
 K = TypeVar("K")
@@ -34,6 +36,8 @@ NAMES: Mapping[str, tuple[str, ...]] = {
 }
 """What columns may be called, whatever the case."""
 WORKBOOKS = (".xlsx", ".xlsm")
+MOST_FAULTS = 1000
+"""Rows with a fault after which reading ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,38 +60,45 @@ class GridPart:
         return GridPart(self.grid, [self.lines[i] for i in places], [self.rows[i] for i in places])
 
     def convert(self, texts: Sequence[K], values: Memo[K, V]) -> list[V]:
-        """Return what the texts of each row mean; a ``CirlError`` of one that means nothing names its line as well."""
+        """Return what the texts of each row mean; of one that means nothing the fallback, and its fault is noted."""
         try:
             return list(map(values.__getitem__, texts))
+        except CirlError:
+            return [self._meaning(line, text, values) for line, text in zip(self.lines, texts, strict=True)]
+
+    def _meaning(self, line: int, text: K, values: Memo[K, V]) -> V:
+        try:
+            return values[text]
         except CirlError as error:
-            line = next(line for line, text in zip(self.lines, texts, strict=True) if text not in values)
-            raise CirlError(f"{self.grid.name}, line {line}: {error}") from error
+            self.grid.note_fault(line, str(error))
+            return values.fallback
 
     def numbers(self, column: int, texts: Sequence[str]) -> Floats:
-        """Return the numbers of a column, shape (rows,); a ``CirlError`` names a negative one, or what is none."""
+        """Return the numbers of a column, shape (rows,); 0 for what is none, or negative, and that fault is noted."""
         try:
             values = list(map(float if "_" not in "".join(texts) else number_in, texts))
         except ValueError:
             values = list(map(number_in, texts))
         array = np.array(values, dtype=float)
-        if not ((array >= 0.0) & (array < math.inf)).all():
-            i = next(i for i, value in enumerate(values) if not 0.0 <= value < math.inf)
-            fault = "is no number; write one as in 1234.5, or leave out the row"
-            if math.isfinite(values[i]):
-                fault = "is negative; a flow runs from source to target: swap them"
-            text = texts[i] if math.isfinite(values[i]) else f"'{texts[i]}'"
-            place = f"{self.grid.name}, line {self.lines[i]}, column '{self.grid.header[column]}'"
-            raise CirlError(f"{place}: {text} {fault}")
-        return array
+        is_good = (array == 0.0) | ((array >= SMALLEST) & (array <= LARGEST))
+        for i in np.flatnonzero(~is_good).tolist():
+            fault = f"{texts[i]} must be 0, or between {SMALLEST:g} and {LARGEST:g} in size"
+            if not math.isfinite(values[i]):
+                fault = f"'{texts[i]}' is no number; write one as in 1234.5, or leave out the row"
+            elif values[i] < 0.0:
+                is_flow = "process" not in self.grid.places and column != self.grid.places.get("uncertainty")
+                fault = f"{texts[i]} is negative" + is_flow * "; a flow runs from source to target: swap them"
+            self.grid.note_fault(self.lines[i], fault, column)
+        return np.where(is_good, array, 0.0)
 
 
 class Memo(dict[K, V]):
-    """What texts mean, found once for each."""
+    """What texts mean, found once for each; ``fallback`` stands for what means nothing until that is told."""
 
-    def __init__(self, meaning: Callable[[K], V]) -> None:
+    def __init__(self, meaning: Callable[[K], V], fallback: V) -> None:
         """Let ``meaning`` find it."""
         super().__init__()
-        self._meaning = meaning
+        self._meaning, self.fallback = meaning, fallback
 
     def __missing__(self, key: K) -> V:
         """Find what a text means."""
@@ -113,6 +124,10 @@ class Grid:
         self._first: Block = lines[1:], rows[1:]
         if not self.header:
             raise CirlError(f"{name}: is empty; its first line names the columns")
+        if separator := next((mark for mark in ";\t|" if len(self.header) == 1 and mark in self.header[0]), ""):
+            remedy = "save it with commas, and with points in numbers, or import the workbook itself"
+            raise CirlError(f"{name}, line 1: its cells are separated by {separator!r}; {remedy}")
+        self._faults: dict[int, str] = {}
         plain = [title.strip().lower() for title in self.header]
         self.places: dict[str, int] = {}
         for key, names in NAMES.items():
@@ -124,17 +139,36 @@ class Grid:
                 self.places[key] = columns[0]
 
     def parts(self) -> Iterator[GridPart]:
-        """Yield the rows below the header; a ``CirlError`` names one that is not as long as it."""
+        """Yield the rows below the header; in the end a ``CirlError`` names what was wrong with them."""
+        width = len(self.header)
         for lines, rows in itertools.chain([self._first], self._blocks):
-            check_lengths(self.name, lines, rows, len(self.header))
-            yield GridPart(self, lines, rows)
+            part = GridPart(self, lines, rows)
+            if not set(map(len, rows)) <= {width}:
+                for line, row in zip(lines, rows, strict=True):
+                    if len(row) != width:
+                        self.note_fault(line, f"{len(row)} cells in {width} columns")
+                part = part.rows_in([len(row) == width for row in rows])
+            yield part
+        self.check()
 
-    def require(self, keys: Sequence[str]) -> None:
+    def note_fault(self, line: int, fault: str, column: int | None = None) -> None:
+        """Keep what is wrong with a row, the first of it; see ``check``."""
+        place = "" if column is None else f", column '{self.header[column]}'"
+        self._faults.setdefault(line, f"{self.name}, line {line}{place}: {fault}")
+        if len(self._faults) == MOST_FAULTS:
+            self.check()
+
+    def check(self) -> None:
+        """Raise a ``CirlError`` if there were faults: it names the first rows, and how many more there are."""
+        if self._faults:
+            raise CirlError("\n".join(first_lines([fault for _, fault in sorted(self._faults.items())])))
+
+    def require(self, keys: Sequence[str], remedy: str = "") -> None:
         """Refuse a grid that lacks one of some columns; a ``CirlError`` names it."""
         for key in keys:
             if key not in self.places:
-                need = f"column '{key}'; it has {', '.join(filter(None, self.header)) or 'none'}"
-                raise CirlError(f"{self.name}, line 1: needs a {need}. Separate columns with commas.")
+                columns = ", ".join(filter(None, self.header)) or "none"
+                raise CirlError(f"{self.name}, line 1: needs a column '{key}'{remedy}; it has {columns}")
 
 
 def _without_blanks(block: Block) -> Block:
@@ -169,6 +203,15 @@ def _sheet_names(path: Path, names: Sequence[str], sheet: str | None) -> Sequenc
     if sheet not in names:
         raise CirlError(f"{path}: {unknown_name('sheet', sheet, names)}")
     return [sheet]
+
+
+def plain_text(text: str) -> str:
+    """Return a name in one form of each letter, with one space between words: what looks alike is alike.
+
+    >>> plain_text(" Scho\u0308n\u00a0 und gut") == "Schön und gut"
+    True
+    """
+    return " ".join(unicodedata.normalize("NFC", text).split())
 
 
 def is_year(text: str) -> bool:

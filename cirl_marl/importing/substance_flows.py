@@ -9,8 +9,8 @@ from typing import Annotated
 import numpy as np
 from scipy.optimize import nnls
 
-from cirl_marl.errors import CirlError
-from cirl_marl.importing.grids import GridPart
+from cirl_marl.errors import CirlError, first_lines
+from cirl_marl.importing.grids import GridPart, plain_text
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.units import factor
@@ -58,7 +58,7 @@ class SubstanceRows:
     def take(self, part: GridPart, unit: str, places: Integers, values: Floats, deviations: Floats) -> None:
         """Take rows of which ``places`` are region, year and pair; ``unit`` is that of rows that state none."""
         units = [text.strip() or unit for text in part.of("unit")]
-        names = map(str.strip, part.of("substance"))
+        names = map(plain_text, part.of("substance"))
         rows = zip(names, part.lines, units, places.T, values.tolist(), deviations.tolist(), strict=True)
         self.entries += ((name, line, part.grid.name, *row) for name, line, *row in rows)
 
@@ -76,23 +76,31 @@ class SubstanceRows:
             labels: names of the pairs.
 
         Raises:
-            CirlError: naming the line of a substance in what does not flow, one that stands twice, a wrong unit, or a
-                year of which nothing is told while there are others.
+            CirlError: naming the lines of substances in what does not flow, that stand twice, or have a wrong unit, or
+                a year of which nothing is told while there are others.
         """
         names = tuple(dict.fromkeys(name for name, *_ in self.entries))
         amounts, lines = np.zeros((len(names), *grid.shape)), np.zeros((len(names), *grid.shape), dtype=np.intp)
         deviations, is_content = np.full((2, *amounts.shape), np.nan)
+        faults: list[str] = []
         for name, line, sheet, text, (region, year, pair), value, deviation in self.entries:
             place = names.index(name), region, year - first_year, pair
             flow, subject = _cell(grid, place[1:]), f"{sheet}, line {line}: {name} of {labels[pair]} in {year}"
             if np.isnan(flow):
-                raise CirlError(f"{subject}: there is no such flow; give the flow itself in a row without substance")
+                faults.append(f"{subject}: there is no such flow; give the flow itself in a row without substance")
+                continue
             if lines[place]:
-                raise CirlError(f"{subject} stands in line {lines[place]} too; leave one out")
-            scale, is_part = amount_scale(f"{sheet}, line {line}", text or stated_unit, unit)
+                faults.append(f"{subject} stands in line {lines[place]} too; leave one out")
+            try:
+                scale, is_part = amount_scale(text or stated_unit, unit)
+            except CirlError as error:
+                faults.append(f"{sheet}, line {line}: {error}")
+                continue
             scale *= flow if is_part else 1.0
             amounts[place], deviations[place] = value * scale, deviation * scale
             is_content[place], lines[place] = is_part, line
+        if faults:
+            raise CirlError("\n".join(first_lines(faults)))
         is_told, flows_at_all = (lines > 0).any(axis=3), np.asarray(grid > 0).any(axis=2)
         is_told_ever = np.any(is_told, axis=2, keepdims=True)
         for e, r, y in np.argwhere(is_told_ever & ~is_told & flows_at_all).tolist():
@@ -107,7 +115,7 @@ def _cell(grid: Floats, place: tuple[int, ...]) -> float:
     return float(grid[place]) if within else np.nan
 
 
-def amount_scale(subject: str, text: str, unit: str) -> tuple[float, bool]:
+def amount_scale(text: str, unit: str) -> tuple[float, bool]:
     """Return by what an amount in a unit is multiplied, and whether it is a part of the whole, in ``unit``."""
     faults = []
     for target in ("1", unit, unit.removesuffix("/year")):
@@ -115,7 +123,7 @@ def amount_scale(subject: str, text: str, unit: str) -> tuple[float, bool]:
             return factor(text, target), target == "1"
         except CirlError as error:
             faults.append(error)
-    raise CirlError(f"{subject}: {faults[1]}; of a substance give a part, as in % or ppm, or an amount in {unit}")
+    raise CirlError(f"{faults[1]}; of a substance give a part, as in % or ppm, or an amount in {unit}")
 
 
 def mixed_amounts(amounts: Floats, flow: Floats, incidence: Floats, silent: Integers) -> Floats:
