@@ -12,7 +12,7 @@ from the roles of the nodes and is never written by hand (Zocco et al., CiRL, De
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -43,6 +43,16 @@ RESERVE = 1e-6
 """Share by which a source without a known reserve starts with more than can be asked of it, so that nothing is cut."""
 
 
+def names_text(names: Sequence[str], most: int = 8) -> str:
+    """Return how many names there are, and the first of them.
+
+    >>> names_text(["mine", "use", "yard"], 2)
+    '3 (mine, use, …)'
+    """
+    listing = ", ".join([*names[:most], *(["…"] if len(names) > most else [])])
+    return f"{len(names)} ({listing})" if names else "0"
+
+
 @dataclass(frozen=True, kw_only=True)
 class Network(Specification):
     """A thermodynamical material network under one scenario; its attributes are those of ``Specification``."""
@@ -53,6 +63,36 @@ class Network(Specification):
         faults = list(problems(self)) or list(() if self.is_variant else limit_problems(self))
         if faults:
             raise NetworkError(f"network '{self.name}'", faults)
+
+    def __str__(self) -> str:
+        """Say in a few lines what it is; ``repr`` has every number.
+
+        >>> from cirl_marl import load_network
+        >>> print(load_network("net_zero"))
+        net_zero: Digester, atmosphere and microalgae: emission against removal
+          scenario: default (others: droop, paper_droop, paper_monod)
+          material: carbon dioxide, in kg and day
+          nodes: 3, of which 0 without stock; arcs: 2
+          agents: 2 (digester, microalgae)
+          services: 1 (methane)
+          episode: 120 intervals of 0.25 day
+        """
+        episode, passing = self.episode, sum(not node.stores for node in self.nodes)
+        others = ", ".join(name for name in sorted(self.scenarios) if name != self.scenario_name)
+        counts = {"agents": self.agents, "services": [service.id for service in self.services]}
+        counts |= {key: [part.id for part in getattr(self, key)] for key in ("accounts", "substances")}
+        counts["disturbances"] = list(self.disturbances)
+        lists = {key: names_text(names) for key, names in counts.items() if names or key in ("agents", "services")}
+        return "\n  ".join(
+            [
+                f"{self.name}: {self.title}".removesuffix(": "),
+                f"scenario: {self.scenario_name}" + (f" (others: {others})" if others else ""),
+                f"material: {self.material}, in {self.mass_unit} and {self.time_unit}",
+                f"nodes: {len(self.nodes)}, of which {passing} without stock; arcs: {len(self.arcs)}",
+                *(f"{key}: {text}" for key, text in lists.items()),
+                f"episode: {episode.horizon} intervals of {episode.control_interval:g} {self.time_unit}",
+            ]
+        )
 
     def __getstate__(self) -> dict[str, object]:
         """Pickle the fields, not the arrays derived from them."""
