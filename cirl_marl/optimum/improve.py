@@ -10,7 +10,7 @@ plain means instead, with controls held and what was lacking on top.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, TypeVar
@@ -19,7 +19,7 @@ import numpy as np
 
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.dynamics.integrator import Dynamics
-from cirl_marl.network import Floats
+from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
 from cirl_marl.optimum.aims import Aims, RateTables
@@ -94,17 +94,13 @@ def improve_plan(
         enough: asked of each episode that is better than those before, whether to stop there.
         progress: called with the share of them that is solved; 1 when no more are needed.
     """
-    slopes = slopes_of(bound, Dynamics(bound.network))
+    slopes = slopes_of(bound.actions.shape, Dynamics(bound.network))
     if slopes > MOST_SLOPES:
         return refine(bound, enough=enough, progress=progress)
-    if starts is None:
-        content_starts = SMALL_STARTS if slopes <= SMALL else CONTENT_STARTS
-        starts = content_starts if any(service.substance for service in bound.network.services) else 1
+    starts = start_count(bound.network, slopes) if starts is None else starts
     trials = Trials(simulate_plan, lambda run, price: penalised_objective(bound, run, price), demand(bound))
     plans: list[Bound] = []
-    for start in range(starts):
-        constant = np.random.default_rng(start).choice([-1.0, 0.0, 1.0], bound.actions.shape[1])
-        actions = np.broadcast_to(constant, bound.actions.shape) if start else bound.actions
+    for start, actions in enumerate(starting_actions(bound.actions, starts)):
         report = partial(_tell, progress, start, starts)
         plan, _ = climb(replace(bound, actions=actions), trials, prices(bound), rounds, enough, report)
         plans.append(plan)
@@ -113,6 +109,21 @@ def improve_plan(
     runs, price = [simulate_plan(plan) for plan in plans], prices(bound)
     ranks = [(-max(shortage(bound, run), TOLERATED_SHORTFALL), penalised_objective(bound, run, price)) for run in runs]
     return plans[ranks.index(max(ranks))]
+
+
+def start_count(network: Network, slopes: int) -> int:
+    """Return how many actions plans begin from whose Jacobians have so many entries."""
+    if not any(service.substance for service in network.services):
+        return 1
+    return SMALL_STARTS if slopes <= SMALL else CONTENT_STARTS
+
+
+def starting_actions(actions: Floats, starts: int) -> Iterator[Floats]:
+    """Yield actions to begin from: those of a plan, then random ones, constant in time and always the same."""
+    yield actions
+    for start in range(1, starts):
+        constant = np.random.default_rng(start).choice([-1.0, 0.0, 1.0], actions.shape[1])
+        yield np.broadcast_to(constant, actions.shape)
 
 
 def _tell(progress: Callable[[float], None], start: int, starts: int, share: float) -> None:
@@ -134,6 +145,7 @@ class Trials:
     rates: Annotated[
         tuple[RateTables, RateTables] | None, "of accounts, and of budgets, over the intervals; None: the network's"
     ] = None
+    free: Annotated[int | None, "how many of the first intervals may change; None: all"] = None
 
 
 def climb(
@@ -189,6 +201,7 @@ def climb(
                 later=trials.later,
                 rates=trials.rates,
                 is_held=is_held,
+                free=trials.free,
             )
             steps.append(_corrected_step(program, best, run, trials, price, value))
         progress(min((done + 1) / rounds, 1.0))

@@ -36,11 +36,10 @@ MOST_SLOPES = 50_000_000
 """Entries of the largest Jacobians of all intervals that are written, 0.4 GB."""
 
 
-def slopes_of(plan: ActionPlan, dynamics: Dynamics) -> int:
-    """Return how many entries the Jacobians of a plan have."""
-    steps, entries = plan.actions.shape
-    stocks = dynamics.rows.nodes.stop
-    return int(steps * (stocks + entries) * (stocks + len(plan.network.arcs)))
+def slopes_of(shape: tuple[int, ...], dynamics: Dynamics) -> int:
+    """Return how many entries the Jacobians of actions of a shape, (steps, entries), have."""
+    (steps, entries), stocks = shape, dynamics.rows.nodes.stop
+    return int(steps * (stocks + entries) * (stocks + len(dynamics.network.arcs)))
 
 
 class ActionPlan(HasPlan, Protocol):
@@ -173,6 +172,7 @@ def step_program(
     later: Later | None = None,
     rates: tuple[RateTables, RateTables] | None = None,
     is_held: bool = False,
+    free: int | None = None,
 ) -> StepProgram:
     """Return the program of the best change of the actions within a trust region, to first order.
 
@@ -196,6 +196,7 @@ def step_program(
         later: what comes after it.
         rates: of the accounts that are weighed, and of the budgets, over its intervals; None: those of the network.
         is_held: whether idle supplies that bring something go on to bring just what is needed, and others nothing.
+        free: how many of the first intervals may change; None: all.
     """
     network, limits = plan.network, plan.aims.limits if limits is None else limits
     steps, entries = plan.actions.shape
@@ -218,6 +219,8 @@ def step_program(
     level, imbalance, count = acts, acts + services, size * steps + services + len(limits)
     step_low = np.concatenate([np.maximum(-trust, -1 - plan.actions), supplies.low], axis=1)
     step_high = np.concatenate([np.minimum(trust, 1 - plan.actions), supplies.high], axis=1)
+    if free is not None:
+        step_low[free:, :entries] = step_high[free:, :entries] = 0.0
     furthest = np.maximum(-step_low, step_high)
     low = np.array([network.interval_means(service.low)[period] for service in network.services]).reshape(-1, steps)
     low *= 1.0 + margin

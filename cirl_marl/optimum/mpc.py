@@ -37,10 +37,12 @@ from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.aims import Aim, Aims, aims_of
 from cirl_marl.optimum.draws import Prices
 from cirl_marl.optimum.futures import DrawnFutures
+from cirl_marl.optimum.improve import start_count, starting_actions
+from cirl_marl.optimum.linearised import MOST_SLOPES, slopes_of
 from cirl_marl.optimum.options import check_margin, check_options, demanded_levels, starting_stocks, with_margin
 from cirl_marl.optimum.solver import Infeasible, SolverFailure
 from cirl_marl.optimum.window_climb import climb_window
-from cirl_marl.optimum.window_planner import FIRST_PRICE, RISE, Future, WindowPlanner
+from cirl_marl.optimum.window_planner import FIRST_PRICE, MOST_ROUNDS, RISE, Future, WindowPlanner
 from cirl_marl.optimum.windows import EMPTY, Continuation, WindowPlan, WindowTask
 
 SERVICE_FIRST = 1000.0
@@ -252,6 +254,8 @@ class MPC(Planner):
         self._planner, self._drawn = WindowPlanner([expected], self._weight), None
         if is_disturbed:
             self._drawn = DrawnFutures(env, expected, self._degree, self._weight, futures, self._delay)
+        dynamics, shape = expected.dynamics, (network.episode.horizon, len(env.actuators.control_rows))
+        self._follows = self._climbs and not is_disturbed and slopes_of(shape, dynamics) <= MOST_SLOPES
         supplies = {arc.makes_up_for for arc in network.arcs if arc.makes_up_for and arc.id not in env.agents}
         self._full = np.array([service.id in supplies for service in network.services], dtype=bool)
         self._outlooks: dict[int, WindowPlan] = {}
@@ -344,9 +348,11 @@ class MPC(Planner):
                 demands = _Demands(deficit, limits, charges, self._present_price(copy, outlook))
         if last is None:
             self._outlooks.pop(copy, None)
+        if self._follows:
+            return self._follow(copy, rest, demands, last)
         if len(window) == len(rest):
             plan = self._plan(copy, window, demands, last)
-            if last is None or self._common_outlook is not None or not len(demands.limits):
+            if last is None or outlook is not None or not len(demands.limits):
                 return plan
             return self._planner.better_of(plan, [last.actions[window.start - last.task.intervals.start :]])
         if outlook is None and copy not in self._outlooks:
@@ -362,6 +368,26 @@ class MPC(Planner):
         if self._prices is not None:
             later = replace(later, costs=self._state_costs(later.costs, copy, window))
         return self._plan(copy, window, demands, last or outlook, later)
+
+    def _follow(self, copy: int, rest: range, demands: _Demands, last: WindowPlan | None) -> WindowPlan:
+        """Plan the rest of an episode in which contents count; within the horizon it may leave the plan before.
+
+        What a window leaves is worth what comes of it if that plan goes on then. In prices of the program substances
+        would go separate ways. The first plan begins from as many actions as ``improve_plan``.
+        """
+        planner, (future,) = self._planner, self._planner.futures
+        if last is None:
+            plan, free = self._plan(copy, rest, demands, None), None
+            starts = start_count(future.network, slopes_of(plan.actions.shape, future.dynamics))
+        else:
+            ahead, free, starts = rest.start - last.task.intervals.start, self._horizon, 1
+            task = self._task(planner, self._stock(copy), rest, demands, last)
+            plan = planner.with_actions(replace(last, task=task), [last.actions[ahead:]])
+        for actions in starting_actions(plan.actions, starts):
+            course, price = climb_window(future, plan.task, actions, self._weight, free)
+            plan = planner.at_price(plan, np.maximum(price, plan.task.price))
+            plan = planner.better_of(plan, [course])
+        return plan
 
     def _present_price(self, copy: int, outlook: WindowPlan) -> Floats:
         """Return what a disturbed copy is charged for budgets that are exceeded and for services that lack.
@@ -422,10 +448,11 @@ class MPC(Planner):
             later: what comes after; None at the end of the episode.
             is_outlook: whether the multipliers must be good, as they are the prices of later plans.
         """
-        stock = self._env.physical.stock[self._env.rows.nodes, copy]
         planner = self._planner if is_outlook or self._drawn is None else self._planners[copy]
-        plan = self._solve_task(planner, stock, intervals, demands, last, later, is_outlook=is_outlook)
-        if self._climbs and not is_outlook:
+        task = self._task(planner, self._stock(copy), intervals, demands, last, later, is_outlook=is_outlook)
+        rounds = 1 if self._follows else MOST_ROUNDS  # what contents come to no correction of the program foresees
+        plan = planner.plan(task, last.basis(intervals) if last else None, self._replan, rounds)
+        if self._climbs and not is_outlook and not self._follows:
             plan = self._climb(planner, plan, last)
         if is_outlook or self._drawn is not None:
             return plan
@@ -450,11 +477,16 @@ class MPC(Planner):
             plan = planner.better_of(plan, [np.concatenate([first[None], course[1:]]) for course in courses])
         return plan
 
+    def _stock(self, copy: int) -> Floats:
+        """Return the stocks of a copy, by stage, shape (rows,), mass."""
+        stock: Floats = self._env.physical.stock[self._env.rows.nodes, copy]
+        return stock
+
     def _neutral_entries(self, copy: int) -> Floats:
         """Return neutral actions of a copy, shape (entries,)."""
         return np.concatenate([action[copy] for action in self._env.neutral_action.values()])
 
-    def _solve_task(
+    def _task(
         self,
         planner: WindowPlanner,
         stock: Floats,
@@ -464,8 +496,8 @@ class MPC(Planner):
         later: Continuation | None = None,
         *,
         is_outlook: bool = False,
-    ) -> WindowPlan:
-        """Plan some intervals from a ``stock``, by stage; see ``_plan``."""
+    ) -> WindowTask:
+        """Return what is to be planned of some intervals from a ``stock``, by stage; see ``_plan``."""
         demand, budgets = None, len(demands.limits)
         if demands.deficit is not None:  # no interval delivers more than all that is wanted
             demand = np.where(self._full, 1.0, np.clip(demands.deficit / len(intervals), 0.0, 1.0))
@@ -474,10 +506,9 @@ class MPC(Planner):
         if price is None:
             price = planner.first_price[: budgets if demand is None else None] if last is None else last.task.price
         is_redrawn = any(low < high for low, high in (part.ends for part in self._env.network.processes.disturbances))
-        task = WindowTask(
+        return WindowTask(
             stock, intervals, demand, later, price, corrections, is_outlook, is_redrawn, demands.limits, demands.charges
         )
-        return planner.plan(task, last.basis(intervals) if last else None, self._replan)
 
     def _look_ahead(self, copies: Sequence[int]) -> None:
         """Prepare plans of some copies of a disturbed network, each for its own futures."""
@@ -510,4 +541,5 @@ class MPC(Planner):
         deficit = None if self._levels is None else self._levels * len(steps)
         demands = _Demands(deficit, self._aims.limits / self._aims.sizes, EMPTY)
         stock = starting_stocks(future.admissible.lifetimes, None)
-        return self._solve_task(self._planner, stock, steps, demands, None, is_outlook=True)
+        task = self._task(self._planner, stock, steps, demands, None, is_outlook=True)
+        return self._planner.plan(task, None, self._replan)

@@ -107,8 +107,8 @@ def smooth_plan(bound: Bound, *, progress: Callable[[float], None] = lambda shar
         CirlError: for a network so large that its Jacobians would have more than MOST_SLOPES entries.
     """
     dynamics, distance = Dynamics(bound.network), Distance(bound)
-    if slopes_of(bound, dynamics) > MOST_SLOPES:
-        size = f"its Jacobians have {slopes_of(bound, dynamics):,} entries, more than {MOST_SLOPES:,}"
+    if slopes_of(bound.actions.shape, dynamics) > MOST_SLOPES:
+        size = f"its Jacobians have {slopes_of(bound.actions.shape, dynamics):,} entries, more than {MOST_SLOPES:,}"
         raise CirlError(f"network '{bound.network.name}': plans cannot be made smooth, as {size}")
     reference = best = centre = _Episode(bound, dynamics)
     value, most, trust, misses = distance(bound.actions), distance.changes(bound.actions), 2.0, 0

@@ -53,7 +53,7 @@ class WindowEpisode:
 
 
 def climb_window(
-    future: Future, task: WindowTask, actions: Floats, service_weight: float | None
+    future: Future, task: WindowTask, actions: Floats, service_weight: float | None, free: int | None = None
 ) -> tuple[Floats, Floats]:
     """Return better actions of a window, shape (intervals, entries), and the price that they needed, as of the task.
 
@@ -62,10 +62,11 @@ def climb_window(
         task: what is planned.
         actions: to begin with.
         service_weight: of the objective; None if services are demanded.
+        free: how many of the first intervals may change; None: all.
     """
     share, aims = len(task.intervals) / future.horizon, future.aims_of(task)
     plan = WindowActions(future.network, future.admissible.agents, task.stock, actions, service_weight, aims)
-    if slopes_of(plan, future.dynamics) > MOST_SLOPES:
+    if slopes_of(actions.shape, future.dynamics) > MOST_SLOPES:
         return actions, task.price
 
     def simulate(trial: WindowActions) -> WindowEpisode:
@@ -85,7 +86,7 @@ def climb_window(
     if later is not None:
         later = replace(later, cost=later.cost / share, level_cost=later.level_cost / share)
     first, rates = future.places(task.intervals).start, future.account_rates(task)
-    trials = Trials(simulate, value, demand, first, later, rates)
+    trials = Trials(simulate, value, demand, first, later, rates, free)
     budgets = len(task.limits)
     services = np.zeros(len(demand)) if task.demand is None else task.price[budgets:]
     price = np.concatenate([services, task.price[:budgets] / (share * future.aims.sizes[:budgets])])

@@ -448,7 +448,9 @@ class WindowPlanner:
         slack_count = len(aims.budgets) + len(network.services)
         self.first_price = np.full(slack_count, FIRST_PRICE * size)
 
-    def plan(self, task: WindowTask, basis: Basis | None, carried_out: int) -> WindowPlan:
+    def plan(
+        self, task: WindowTask, basis: Basis | None, carried_out: int, most_rounds: int = MOST_ROUNDS
+    ) -> WindowPlan:
         """Return the best plan that is found, of which the first intervals will be ``carried_out``.
 
         Raises:
@@ -457,7 +459,7 @@ class WindowPlanner:
         near = FALLS_SHORT * self._scale
         trial = best = self._first_trial(task, basis)
         task = replace(task, corrections=trial.task.corrections)
-        for done in range(1, MOST_ROUNDS + 1):
+        for done in range(1, most_rounds + 1):
             # beside budgets prices of service rise with theirs, and plans are compared at the same ones
             if trial.merit > (self._merit(best, trial.task.price) if len(task.limits) else best.merit):
                 best = trial
@@ -474,7 +476,7 @@ class WindowPlanner:
                 excess = sum((now.excess - before.excess).sum(axis=0) for now, before in pairs) / len(pairs)
                 if np.abs(error).max(initial=0.0) <= TOLERANCE and np.abs(excess).max(initial=0.0) <= EXCEEDED:
                     break
-            if done < MOST_ROUNDS:
+            if done < most_rounds:
                 task = replace(trial.task, corrections=trial.corrections)
                 try:
                     trial = self._trial(task, trial.basis(task.intervals))
@@ -527,15 +529,19 @@ class WindowPlanner:
         Where demands have to be met they must not lack more, however much that saves. Actions are those in each future,
         shape (intervals, entries), the first of which are the same in all.
         """
+        other = self.with_actions(plan, actions)
+        if plan.task.has_to_serve and self._shortage(other) > self._shortage(plan) + ROUGH_SHORTFALL:
+            return plan
+        return other if other.merit > self._merit(plan, plan.task.price) else plan
+
+    def with_actions(self, plan: WindowPlan, actions: Sequence[Floats]) -> WindowPlan:
+        """Return a plan with other actions, and what comes of them; see ``better_of``."""
         outcomes = [future.carry_out(plan.task, course) for future, course in zip(self.futures, actions, strict=True)]
         level = np.mean([np.minimum(outcome.level, 1.0).mean(axis=0) for outcome in outcomes], axis=0)
         bookings = np.mean([outcome.bookings for outcome in outcomes], axis=0)
         value = float(np.mean([outcome.value for outcome in outcomes]))
         other = replace(plan, actions=actions[0], level=level, bookings=bookings, value=value)
-        if plan.task.has_to_serve and self._shortage(other) > self._shortage(plan) + ROUGH_SHORTFALL:
-            return plan
-        merit = self._merit(other, plan.task.price)
-        return replace(other, merit=merit) if merit > self._merit(plan, plan.task.price) else plan
+        return replace(other, merit=self._merit(other, plan.task.price))
 
     def at_price(self, plan: WindowPlan, price: Floats) -> WindowPlan:
         """Return a plan at another price of what is exceeded and lacks, shape (budgets + services,)."""
