@@ -112,9 +112,9 @@ def by_component(network: Network, whole: Floats, substances: Floats) -> Floats:
     return np.concatenate([(whole - parts.sum(axis=0))[None], parts]).swapaxes(0, 1)
 
 
-def town(high: float = 40.0, *, sorts: bool = False, copper: float = 0.2, brought: float = 80.0) -> Network:
+def town(high: float = 40.0, *, sorts: bool = False, copper: float = 0.2, life: float = LIFE) -> Network:
     """Return homes and sheds that are built by a market, which loses more of copper; somebody may bring more."""
-    dies = Lifetime(mean=LIFE, deviation=0.3 * LIFE, distribution="normal")
+    dies = Lifetime(mean=life, deviation=0.3 * life, distribution="normal")
     substances = (Substance(id="copper"),) if copper else ()
     content = {"copper": copper} if copper else {}
     sorter = Control(kind=ControlKind.TRANSFER, low=0.1, neutral=0.3, high=0.5, substances=("copper",))
@@ -127,12 +127,12 @@ def town(high: float = 40.0, *, sorts: bool = False, copper: float = 0.2, brough
             Node(id="pit", role=Role.NONRENEWABLE_RESERVOIR, initial=(1e6, 1e6)),
             Node(id="market", stores=False),
             Node(id="homes", initial=(80.0, 80.0), lifetime=dies, content=content),
-            Node(id="sheds", initial=(30.0, 30.0), lifetime=replace(dies, mean=0.6 * LIFE)),
+            Node(id="sheds", initial=(30.0, 30.0), lifetime=replace(dies, mean=0.6 * life)),
             Node(id="dump", role=Role.LANDFILL, initial=(0.0, 0.0)),
         ),
         arcs=(
             Arc(id="supply", donor="quarry", recipient="market", **supply),
-            Arc(id="bring", donor="pit", recipient="market", law=Law.CONTROLLED, control=flow(brought)),
+            Arc(id="bring", donor="pit", recipient="market", law=Law.CONTROLLED, control=flow(80.0)),
             Arc(id="homing", donor="market", recipient="homes", law=Law.SHARE, share=0.6),
             Arc(id="losing", donor="market", recipient="dump", law=Law.SHARE, share=0.1, **losses),
             Arc(id="shedding", donor="market", recipient="sheds", law=Law.SHARE),
@@ -250,12 +250,14 @@ def test_what_nobody_can_change_is_bounded_by_what_happens(merged: bool) -> None
 
 @pytest.mark.parametrize("copper", [0.0, 0.2])
 def test_several_stocks_that_a_market_fills_lack_nothing_where_enough_arrives(copper: float) -> None:
-    """What the market has is shared out, and its losses are not made less: 90 % of the service is no cheaper than all."""
-    network = town(copper=copper, brought=1e-6)
+    """What a market has is shared out, so that no flood dies out at once: 90 % of the service costs what all does."""
+    network = town(copper=copper, life=4 * LIFE)
+    pit = replace(network.arcs[1], control=flow(1e-6))
+    network = replace(network, arcs=(network.arcs[0], pit, *network.arcs[2:]))
     solution = bound(network, min_service=0.9)
     run = simulate_plan(replace(solution, actions=np.full_like(solution.actions, -1.0)))
     assert float(run.episode_levels.min()) == pytest.approx(1.0)
-    assert solution.objective == pytest.approx(float(run.episode_circularity[0]), rel=1e-4)
+    assert solution.objective == pytest.approx(float(run.episode_circularity[0]), rel=1e-3)
     assert solution.objective >= float(run.episode_circularity[0])
 
 
