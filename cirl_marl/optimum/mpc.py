@@ -42,7 +42,7 @@ from cirl_marl.optimum.linearised import MOST_SLOPES, slopes_of
 from cirl_marl.optimum.options import check_margin, check_options, demanded_levels, starting_stocks, with_margin
 from cirl_marl.optimum.solver import Infeasible, SolverFailure
 from cirl_marl.optimum.window_climb import climb_window
-from cirl_marl.optimum.window_planner import FIRST_PRICE, MOST_ROUNDS, RISE, Future, WindowPlanner
+from cirl_marl.optimum.window_planner import FIRST_PRICE, MOST_ROUNDS, NOTABLE, RISE, Future, WindowPlanner
 from cirl_marl.optimum.windows import EMPTY, Continuation, WindowPlan, WindowTask
 
 SERVICE_FIRST = 1000.0
@@ -59,8 +59,6 @@ LEAD = 0.05
 before a service costs no more than in the plan of the expected episode."""
 SPREAD = 0.5
 """ε: the part by which a budget of a disturbed episode is dearer beyond its plan, and cheaper below."""
-NOTABLE = 2e-3
-"""Part of a budget, or level of a service, by which a plan misses it and says so."""
 FIRST_SAMPLE, SAMPLES = 2**30, 256
 """First seed and number of the paths over which what is expected of their functions is averaged."""
 
@@ -351,10 +349,7 @@ class MPC(Planner):
         if self._follows:
             return self._follow(copy, rest, demands, last)
         if len(window) == len(rest):
-            plan = self._plan(copy, window, demands, last)
-            if last is None or outlook is not None or not len(demands.limits):
-                return plan
-            return self._planner.better_of(plan, [last.actions[window.start - last.task.intervals.start :]])
+            return self._plan(copy, window, demands, last)
         if outlook is None and copy not in self._outlooks:
             self._outlooks[copy] = self._plan(copy, rest, demands, None, is_outlook=True)
         outlook = outlook or self._outlooks[copy]
@@ -452,7 +447,11 @@ class MPC(Planner):
         task = self._task(planner, self._stock(copy), intervals, demands, last, later, is_outlook=is_outlook)
         rounds = 1 if self._follows else MOST_ROUNDS  # what contents come to no correction of the program foresees
         plan = planner.plan(task, last.basis(intervals) if last else None, self._replan, rounds)
-        if self._climbs and not is_outlook and not self._follows:
+        keeps_budgets = self._drawn is None and bool(self._aims.budgets)
+        if keeps_budgets and demands.deficit is not None:  # idle supplies are planned in full, and may be short
+            demanded = np.clip(demands.deficit / len(intervals), 0.0, 1.0)
+            plan = planner.at_price(replace(plan, task=replace(plan.task, demand=demanded)), plan.task.price)
+        if (self._climbs or keeps_budgets) and not is_outlook and not self._follows:
             plan = self._climb(planner, plan, last)
         if is_outlook or self._drawn is not None:
             return plan
@@ -468,6 +467,8 @@ class MPC(Planner):
             ahead = plan.task.intervals.start - last.task.intervals.start
             places = np.minimum(np.arange(ahead, ahead + len(plan.actions)), len(last.actions) - 1)
             plan = planner.better_of(plan, [last.actions[places]] * len(planner.futures))
+            if not self._climbs and planner.is_kept(plan):
+                return plan
         climbs = [climb_window(future, plan.task, plan.actions, self._weight) for future in planner.futures]
         courses, prices = zip(*climbs, strict=True)
         if plan.task.has_to_serve:

@@ -67,6 +67,8 @@ FALLS_SHORT = 2e-3
 """By how much the simulator must not miss what a program promises, in λ̄/circularity_scale."""
 EXCEEDED = 1e-5
 """Part of a budget by which what a plan books may differ from what was reckoned with, without a further round."""
+NOTABLE = 2e-3
+"""Part of a budget, or level of a service, by which a plan misses it and says so."""
 TOLERANCE = 2e-4
 """Level by which the intervals that are carried out may miss what is planned, in the mean, without a further round."""
 
@@ -530,8 +532,12 @@ class WindowPlanner:
         shape (intervals, entries), the first of which are the same in all.
         """
         other = self.with_actions(plan, actions)
-        if plan.task.has_to_serve and self._shortage(other) > self._shortage(plan) + ROUGH_SHORTFALL:
-            return plan
+        if plan.task.has_to_serve:
+            for least, shortage in zip(self._shortages(plan), self._shortages(other), strict=True):
+                if shortage > least + ROUGH_SHORTFALL:
+                    return plan
+                if len(plan.task.limits) and least > max(shortage, NOTABLE) + ROUGH_SHORTFALL:
+                    return other
         return other if other.merit > self._merit(plan, plan.task.price) else plan
 
     def with_actions(self, plan: WindowPlan, actions: Sequence[Floats]) -> WindowPlan:
@@ -543,18 +549,20 @@ class WindowPlanner:
         other = replace(plan, actions=actions[0], level=level, bookings=bookings, value=value)
         return replace(other, merit=self._merit(other, plan.task.price))
 
+    def is_kept(self, plan: WindowPlan) -> bool:
+        """Return whether a plan keeps budgets and services but for what no round would mend."""
+        return max(self._shortages(plan)) <= ROUGH_SHORTFALL
+
     def at_price(self, plan: WindowPlan, price: Floats) -> WindowPlan:
         """Return a plan at another price of what is exceeded and lacks, shape (budgets + services,)."""
         return replace(plan, task=replace(plan.task, price=price), merit=self._merit(plan, price))
 
-    def _shortage(self, plan: WindowPlan) -> float:
-        """Return the sum of the parts by which budgets are exceeded and of what services lack."""
-        task, shortage = plan.task, 0.0
-        if len(task.limits):
-            shortage += float(np.maximum(0.0, plan.bookings.sum(axis=0) - task.limits).sum())
-        if task.demand is not None:
-            shortage += float(np.maximum(0.0, task.demand - plan.level).sum())
-        return shortage
+    def _shortages(self, plan: WindowPlan) -> tuple[float, float]:
+        """Return the sum of what services lack, and that of the parts by which budgets are exceeded."""
+        task = plan.task
+        lack = 0.0 if task.demand is None else np.maximum(0.0, task.demand - plan.level).sum()
+        excess = np.maximum(0.0, plan.bookings.sum(axis=0) - task.limits).sum() if len(task.limits) else 0.0
+        return float(lack), float(excess)
 
     def _merit(self, plan: WindowPlan, price: Floats) -> float:
         """Return the objective of a plan, less what it exceeds and lacks at a price, shape (budgets + services,)."""
