@@ -18,7 +18,10 @@ from cirl_marl import CirlError, MultiAgentVectorEnv, RecipeError, RunError, loa
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.assessment import acting_checkpoint
+from cirl_marl.learners import trainer
+from cirl_marl.learners.checkpoint import observation_statistics
 from cirl_marl.learners.interface import Trained, resume, train
+from cirl_marl.learners.policies import Policies, Policy
 from cirl_marl.learners.recipe import LearnerSettings, Recipe, Run
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.learners.validation import FIRST_SEED, LARGEST_MULTIPLIER, Multipliers, Score, validation_score
@@ -44,6 +47,42 @@ def evaluations(run: RunDirectory) -> list[dict[str, float]]:
     """Return the rows of ``evaluations.csv``."""
     with (run.path / "evaluations.csv").open() as file:
         return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+
+
+def numbers(policy: Policy) -> np.ndarray:
+    """Return the weights of a policy, then the moments of what it observes."""
+    assert policy.normaliser is not None
+    weights = [value.numpy().ravel() for value in policy.model.policy.state_dict().values()]
+    moments = observation_statistics(policy.normaliser)["observation"]
+    return np.concatenate([*weights, moments.mean, moments.var])
+
+
+@pytest.mark.parametrize(("first", "share"), [(0.995, 0.5625), (0.985, 0.0)])
+def test_policies_between_serve_just_enough(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, first: float, share: float
+) -> None:
+    """Of two evaluations the first serves and the last does not: what acts is between, if the first serves at all."""
+    seen: list[np.ndarray] = []
+    assured = [first, 0.98, 0.995, 0.985, 0.985, 0.991]
+
+    def score(env: MultiAgentVectorEnv, policies: Policies, aims: object) -> Score:
+        seen.append(numbers(policies.policies["mine"]))
+        return Score(float(len(seen)), 1.0, assured[len(seen) - 1], 0.0)
+
+    monkeypatch.setattr(trainer, "validation_score", score)
+    monkeypatch.setattr(trainer, "StackedPolicies", lambda all_, _: Policies({k: v.policy for k, v in all_.items()}))
+    climb = recipe(engine="gradients", min_service=0.99, steps=24, evaluations=2)
+    options: dict[str, Any] = {"horizon": HORIZON, "circularity": "mean"}
+    last = numbers(train("copper_net", climb, directory=tmp_path / "run", **options).learners["mine"].policy)
+    start, *between = seen[0], *seen[2:]
+    shares = [0.5, 0.75, 0.625, 0.5625] if share else []
+    for numbers_there, expected in zip(between, shares, strict=True):
+        np.testing.assert_allclose(numbers_there, (1 - expected) * start + expected * last, atol=1e-6)
+    acting = numbers(Trained(tmp_path / "run").policies["mine"])
+    np.testing.assert_allclose(acting, (1 - share) * start + share * last, atol=1e-6)
+    seen.clear()  # a training that is kept nowhere tries nothing, and ends alike
+    np.testing.assert_array_equal(numbers(train("copper_net", climb, **options).learners["mine"].policy), last)
+    assert len(seen) == 2
 
 
 @pytest.mark.medium

@@ -22,14 +22,16 @@ from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RecipeError, RunError, unknown_name
 from cirl_marl.learners.checkpoint import read_tree, write_tree
 from cirl_marl.learners.demonstrations import Demonstrator
-from cirl_marl.learners.learner import Learner, derived_seed, has_tensorboard
+from cirl_marl.learners.interpolation import Interpolation
+from cirl_marl.learners.learner import Learner, derived_seed, has_tensorboard, load_acting_learner
 from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, Streams, TrainingStop
+from cirl_marl.learners.policies import Policies
 from cirl_marl.learners.recipe import Start
 from cirl_marl.learners.run_directory import RunConfig, RunDirectory, TableFile, steps_of
 from cirl_marl.learners.stacked.conditions import gradient_obstacle, gradient_stacks, obstacle, stacks
 from cirl_marl.learners.stacked.stack import Stack, StackedPolicies
 from cirl_marl.learners.start import begin_again, begin_from
-from cirl_marl.learners.validation import Multipliers, Score, validation_score
+from cirl_marl.learners.validation import Multipliers, Rank, Score, validation_score
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import CIRCULARITY
 from cirl_marl.optimum.aims import aims_of
@@ -46,6 +48,8 @@ EVALUATION_COLUMNS = (
     "joint_step", "env_steps", "circularity", "service", "assured", "paid", "circularity_weight", "best",
 )  # fmt: skip
 """Columns of ``evaluations.csv``."""
+HALVINGS = 4
+"""Policies that are tried between those that serve and the last ones."""
 COST = 0.02
 """Part of the time that checkpoints may take; they come less often if the last one took more."""
 
@@ -85,6 +89,7 @@ class Training:
         self._metrics: TableFile | None = None
         self._evaluations: TableFile | None = None
         self._best: Score | None = None
+        self._last_score: Score | None = None
         self._stacks: Sequence[Stack] = ()
         self._saved_state = None
         self.done = 0 if checkpoint is None else steps_of(checkpoint)
@@ -260,6 +265,7 @@ class Training:
             self._evaluate()
         self._bring_up_to_date()
         if self.run is not None:
+            self._try_between(self.run)
             partial_folder = self.run.begin_checkpoint()
             for learner in self.learners.values():
                 learner.write_state(partial_folder, {}, last=True)
@@ -338,18 +344,45 @@ class Training:
         self._bring_up_to_date()
         policies = StackedPolicies(self.learners, self._stacks)
         score = validation_score(self._validation_env, policies, self._aims)
-        target = self.config.recipe.run.min_service, {budget.name: budget.most for budget in self._aims.budgets}
-        self._last_evaluation = self.joint_steps
-        better = self._best is None or score.rank(*target) > self._best.rank(*target)
-        if better:
-            self._best = score
-            if self.run is not None:
-                self.run.save_best(self.joint_steps, self._write_policies, score.as_dict())
+        self._last_evaluation, self._last_score = self.joint_steps, score
+        better = self._keep_if_best(score)
         if self._evaluations is not None:
             steps = (self.joint_steps, self.joint_steps * self.config.envs)
             row = (score.circularity, score.service, score.service_bound, score.episode_return)
             self._evaluations.append([*steps, *row, self.env.circularity_weight, better])
         return score
+
+    def _keep_if_best(self, score: Score) -> bool:
+        """Let the policies of now act if their ``score`` is the best so far; return whether it is."""
+        if self._best is not None and self._rank(score) <= self._rank(self._best):
+            return False
+        self._best = score
+        if self.run is not None:
+            self.run.save_best(self.joint_steps, self._write_policies, score.as_dict())
+        return True
+
+    def _rank(self, score: Score) -> Rank:
+        budgets = {budget.name: budget.most for budget in self._aims.budgets}
+        return score.rank(self.config.recipe.run.min_service, budgets)
+
+    def _try_between(self, run: RunDirectory) -> None:
+        """Where the last policies of exact gradients lack what those that act serve, let the best between them act."""
+        env, best, last = self._validation_env, self._best, self._last_score
+        if self.config.recipe.run.engine != "gradients" or env is None or best is None or last is None:
+            return
+        if not self._rank(best)[0] or self._rank(last)[0]:
+            return
+        folder = run.acting_checkpoint
+        acting = {name: load_acting_learner(folder, group, env) for name, group in self.groups.items()}
+        between, low, high = Interpolation(self.learners, acting), 0.0, 1.0
+        for _ in range(HALVINGS):
+            share = (low + high) / 2
+            between.set(share)
+            policies = Policies({name: learner.policy for name, learner in self.learners.items()})
+            score = validation_score(env, policies, self._aims)
+            low, high = (share, high) if self._rank(score)[0] else (low, share)
+            self._keep_if_best(score)
+        between.set(1.0)
 
     def _write_policies(self, folder: Path) -> None:
         for learner in self.learners.values():
