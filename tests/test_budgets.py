@@ -37,7 +37,7 @@ from cirl_marl.optimum.windows import WindowPlan, WindowTask
 
 def test_budgets_are_kept_at_a_price_between_the_difference_quotients() -> None:
     """The multiplier of a budget of carbon is its price, within 1 % of quotients of solved programs."""
-    network = city().with_options(episode={"horizon": 30})
+    network = city().with_options(episode={"horizon": 14})
     free = bound(network, min_service=0.95)
     least = bound(network, aim="emissions", min_service=0.95)
     budget = float(0.5 * (free.accounts[1] - least.objective))

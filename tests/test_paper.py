@@ -581,7 +581,7 @@ def test_first_and_last_episodes_do_not_overlap(episodes: int, window: int, monk
     """r_s and r_e are means over 100 episodes each, or over half of those that there were."""
     returns = list(np.random.default_rng(0).normal(size=episodes))
     done = TrainingRecord(
-        predict=lambda *_: (np.zeros((20, 1), dtype=np.float32), None),
+        predict=lambda *_: (np.zeros((2, 1), dtype=np.float32), None),
         ends=[50 * (i + 1) for i in range(episodes)],
         returns=returns,
         steps=50 * episodes,
@@ -591,7 +591,7 @@ def test_first_and_last_episodes_do_not_overlap(episodes: int, window: int, monk
         options={},
     )
     monkeypatch.setattr(rows, "train_published", lambda *_: done)
-    monkeypatch.setattr(rows, "EVALUATION_EPISODES", 20)
+    monkeypatch.setattr(rows, "EVALUATION_EPISODES", 2)
     found = run_row(PaperRow(environment="CopperNet", algorithm="A2C", steps=50 * episodes))
     assert found.start_return == pytest.approx(np.mean(returns[:window]))
     assert found.end_return == pytest.approx(np.mean(returns[-window:]))

@@ -233,15 +233,29 @@ def test_fitted_prices_close_what_foresight_is_worth() -> None:
     assert best - 1e-8 <= fitted <= informed - 0.5 * (informed - best)
 
 
+@pytest.fixture(scope="module")
+def works_paths() -> Paths:
+    """Return all paths of the works."""
+    return Paths.of(works(4))
+
+
+@pytest.fixture(scope="module")
+def works_prices(works_paths: Paths) -> tuple[Prices, Prices]:
+    """Return prices of the works of perfect information, and fitted ones."""
+    drawn = np.random.default_rng(3).choice(len(works_paths.chance), 32, p=works_paths.chance)
+    return fit_prices([works_paths.programs[i] for i in drawn], np.array([DEMAND]), 1.0)
+
+
+def proofs(paths: Paths, prices: Prices) -> tuple[Floats, Floats]:
+    """Return what is proved on each path under prices, and what of it shocks add by themselves."""
+    values = np.array([program.prove(program.with_prices(prices)).value for program in paths.programs])
+    return values, np.array([prices.luck(program.draw.new) for program in paths.programs])
+
+
 @pytest.mark.medium
-def test_luck_of_draws_narrows_the_interval() -> None:
+def test_luck_of_draws_narrows_the_interval(works_paths: Paths, works_prices: tuple[Prices, Prices]) -> None:
     """What shocks by themselves add has mean 0 over all paths, and follows what draws are worth."""
-    network = works(4)
-    paths = Paths.of(network)
-    drawn = np.random.default_rng(1).choice(len(paths.chance), 32, p=paths.chance)
-    informed, _ = fit_prices([paths.programs[i] for i in drawn], np.array([DEMAND]), 1.0)
-    values = np.array([program.prove(program.with_prices(informed)).value for program in paths.programs])
-    luck = np.array([informed.luck(program.draw.new) for program in paths.programs])
+    paths, (values, luck) = works_paths, proofs(works_paths, works_prices[0])
     assert paths.chance @ luck == pytest.approx(0.0, abs=1e-12)
     spreads = [paths.chance @ (part - paths.chance @ part) ** 2 for part in (values, values - luck)]
     assert spreads[1] < 0.5 * spreads[0]
@@ -267,10 +281,9 @@ def test_improvement_never_rises(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.medium
-def test_a_wrong_mean_is_not_a_bound() -> None:
+def test_a_wrong_mean_is_not_a_bound(works_paths: Paths) -> None:
     """What a conditional mean that is estimated from draws would prove is beaten by all paths."""
-    network = works(4)
-    paths = Paths.of(network)
+    network, paths = works(4), works_paths
     best, _, level_price = paths.best(DEMAND)
     charged = prices_of(network, 0, 0.0, DEMAND, level_price)
     # regression on the regime before, from few draws: its error has a mean that can be exploited
@@ -553,25 +566,18 @@ def test_no_policy_exceeds_it(
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize(("draws_made", "covered"), [(12, 0.88), (64, 0.93)])
-def test_the_interval_covers_what_it_says(draws_made: int, covered: float) -> None:
+def test_the_interval_covers_what_it_says(works_paths: Paths, works_prices: tuple[Prices, Prices]) -> None:
     """Whoever draws anew has an upper end above the best policy, the extensive form, about as often as is said."""
-    network = works(4)
-    paths = Paths.of(network)
-    best = paths.best(DEMAND)[0]
-    rng = np.random.default_rng(3)
-    fitted_to = rng.choice(len(paths.chance), 32, p=paths.chance)
-    _, prices = fit_prices([paths.programs[i] for i in fitted_to], np.array([DEMAND]), 1.0)
-    values = np.array([program.prove(program.with_prices(prices)).value for program in paths.programs])
-    luck = np.array([prices.luck(program.draw.new) for program in paths.programs])
+    chance, (values, luck) = works_paths.chance, proofs(works_paths, works_prices[1])
     # about what is proved on average, which no policy exceeds, so that nothing but the interval counts
-    proved = paths.chance @ values
-    assert proved >= best - 1e-8
-    drawn = rng.choice(len(paths.chance), (2000, draws_made), p=paths.chance)
-    samples = (SimpleNamespace(values=values[row], luck=luck[row]) for row in drawn)
+    proved = chance @ values
+    assert proved >= works_paths.best(DEMAND)[0] - 1e-8
     half_width = vars(uncertain_bound.UncertainBound)["half_width"].fget
-    ends = [float((sample.values - sample.luck).mean()) + half_width(sample) for sample in samples]
-    assert covered <= np.mean(np.array(ends) >= proved) <= 0.99
+    for draws_made, covered in ((12, 0.88), (64, 0.93)):
+        drawn = np.random.default_rng(4).choice(len(chance), (2000, draws_made), p=chance)
+        samples = (SimpleNamespace(values=values[row], luck=luck[row]) for row in drawn)
+        ends = [float((sample.values - sample.luck).mean()) + half_width(sample) for sample in samples]
+        assert covered <= np.mean(np.array(ends) >= proved) <= 0.99, draws_made
 
 
 def small_bound(**options: Any) -> Any:
