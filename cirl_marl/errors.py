@@ -6,8 +6,9 @@ import difflib
 from collections.abc import Iterable, Sequence
 from importlib import import_module
 from numbers import Integral
-from typing import Any
+from typing import Any, TypeVar
 
+T = TypeVar("T")
 LONGEST_LINE = 1200
 """Characters of a line of a message; of a longer one, which repeats what is in a file, the middle is left out."""
 MOST_LINES = 10
@@ -76,6 +77,17 @@ class RunError(CirlError):
 
 class LearnerError(RuntimeError):
     """A learner failed while training; names its agent and the joint step."""
+
+
+def instance_of(kind: type[T], name: str, value: object) -> T:
+    """Return a value of a class; a ``CirlError`` names one of another.
+
+    >>> instance_of(dict, "options", {})
+    {}
+    """
+    if not isinstance(value, kind):
+        raise CirlError(f"{name} must be a {kind.__name__}, got {value!r}")
+    return value
 
 
 def whole_number(name: str, value: object, least: int) -> int:

@@ -303,6 +303,55 @@ def test_devices_that_are_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert not any(tmp_path.iterdir())
 
 
+WHOLE: Any = object()
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: cirl_marl.write_network(WHOLE, "x.toml"), "network must be a Network, got <object"),
+        (lambda: cirl_marl.indicators(WHOLE, WHOLE), "network must be a Network"),
+        (lambda: cirl_marl.interval_ends(WHOLE), "network must be a Network"),
+        (lambda: cirl_marl.gradient(WHOLE, WHOLE), "env must be a MultiAgentVectorEnv"),
+        (lambda: cirl_marl.improve_schedule(WHOLE, WHOLE), "env must be a MultiAgentVectorEnv"),
+        *(
+            (lambda call=call: call(WHOLE), "bound must be a Bound")
+            for call in (cirl_marl.improve_plan, cirl_marl.smooth_plan, cirl_marl.simulate_plan)
+        ),
+        (lambda: cirl_marl.write_package("x", WHOLE), "simulation must be a Simulation"),
+        (lambda: cirl_marl.write_iamc("x.csv", [WHOLE]), "each of simulations must be a Simulation"),
+        *(
+            (lambda call=call: call(WHOLE), "network must be a name of the catalogue, a file or a Network")
+            for call in (
+                cirl_marl.load_network,
+                cirl_marl.bound,
+                cirl_marl.explain,
+                cirl_marl.levers,
+                cirl_marl.vector_env,
+                cirl_marl.single_agent_env,
+                cirl_marl.train,
+            )
+        ),
+        (lambda: cirl_marl.infer(WHOLE, []), "network must be a name of the catalogue"),
+        (lambda: cirl_marl.account_front(WHOLE, "ab"), "network must be a name of the catalogue"),
+        (lambda: cirl_marl.pareto_front(WHOLE, directory="x"), "network must be a name of the catalogue"),
+        (lambda: cirl_marl.compare(network=WHOLE), "network must be a name of the catalogue"),
+    ],
+)
+def test_arguments_of_another_type(call: Any, said: str) -> None:
+    """Are named, with what was expected, by each public function that takes an object of this library."""
+    with pytest.raises(CirlError) as refused:
+        call()
+    assert said in str(refused.value)
+
+
+def test_a_network_is_itself() -> None:
+    """What names a network may be one, under a scenario of it."""
+    network = cirl_marl.load_network("copper_net")
+    assert cirl_marl.load_network(network) is network
+    assert cirl_marl.load_network(network, scenario="paper").scenario_name == "paper"
+
+
 def test_every_path_may_be_a_text() -> None:
     """Of every public function: who has a ``Path`` of it is no exception."""
     for name in cirl_marl.__all__:

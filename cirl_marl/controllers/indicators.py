@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
+from cirl_marl.errors import instance_of
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Role
@@ -44,7 +45,7 @@ class Indicators:
 
 def indicators(network: Network, flow: Annotated[Floats, "shape (arcs,), mass/time"]) -> Indicators | None:
     """Return the indicators of mean flows; None if nothing is in use, or nothing enters or leaves it."""
-    use = _in_use(network)
+    use = _in_use(instance_of(Network, "network", network))
     count, roles = len(network.nodes), [node.role for node in network.nodes]
     flows = sparse.csr_array((flow, (network.donors, network.recipients)), shape=(count, count))
     lost = np.array([role in LOST for role in roles])

@@ -12,7 +12,7 @@ from cirl_marl.controllers.basic import Arrays, Controller, Planner
 from cirl_marl.dynamics.laws import LAWS
 from cirl_marl.environments.present import PresentEnv
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import ControlError, whole_number
+from cirl_marl.errors import ControlError, instance_of, whole_number
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 
@@ -234,7 +234,8 @@ def starting_stocks(env: MultiAgentVectorEnv, seed: int) -> Floats:
 
 def interval_ends(network: Network) -> Floats:
     """Return the time at which each control interval of an episode ends, shape (steps,)."""
-    return np.multiply(np.arange(1, network.episode.horizon + 1), network.episode.control_interval, dtype=np.float64)
+    episode = instance_of(Network, "network", network).episode
+    return np.multiply(np.arange(1, episode.horizon + 1), episode.control_interval, dtype=np.float64)
 
 
 def first_seed(seed: int) -> int:

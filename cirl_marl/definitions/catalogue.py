@@ -53,17 +53,22 @@ def recipes() -> list[str]:
     return sorted(path.stem for path in folder("agents").glob("*.toml"))
 
 
-def load_network(name: str | Path, *, scenario: str | None = None, allow_code: bool = False) -> Network:
+def load_network(name: str | Path | Network, *, scenario: str | None = None, allow_code: bool = False) -> Network:
     """Return a network of the catalogue, or of a definition file if ``name`` ends in ``.toml`` or ``.toml:REGION``.
 
-    A network of the catalogue has a name, as ``copper_net``, and ids, as ``cirl_marl/copper_net.paper-v0``. It is under
-    ``scenario``; None is the default, physical one, or that of the id. With ``allow_code`` the file may name models of
-    its own, whose modules are then imported; those that are imported already need no leave.
+    A network of the catalogue has a name, as ``copper_net``, and ids, as ``cirl_marl/copper_net.paper-v0``; a
+    ``Network`` is itself. It is under ``scenario``; None is the default, physical one, or that of the id. With
+    ``allow_code`` the file may name models of its own, whose modules are then imported; those that are imported already
+    need no leave.
 
     Raises:
         DefinitionError: if the file has mistakes; all are named.
         CirlError: if there is no such network or scenario.
     """
+    if isinstance(name, Network):
+        return name.scenario(scenario)
+    if not isinstance(name, str | Path):
+        raise CirlError(f"network must be a name of the catalogue, a file or a Network, got {name!r}")
     if "\0" in str(name):
         raise CirlError(f"{str(name)!r} is no name of a network or file: it has a character without a sign")
     path_and_region, variant = file_and_region(str(name)), None

@@ -20,7 +20,7 @@ from cirl_marl.definitions.error_messages import choices, toml_mistake, validati
 from cirl_marl.definitions.overrides import COMMON_KEYS, overlay, path_mistakes, stranger_mistakes, without_paths
 from cirl_marl.definitions.region_copies import compose_copies, copied_file
 from cirl_marl.definitions.schema import NetworkTable
-from cirl_marl.errors import CirlError, DefinitionError, NetworkError, unknown_name
+from cirl_marl.errors import CirlError, DefinitionError, NetworkError, instance_of, unknown_name
 from cirl_marl.network import Network
 from cirl_marl.records.files import read_content, sha256_of, write_atomically
 
@@ -166,7 +166,7 @@ def write_network(network: Network, path: str | Path) -> None:
     """Write a network built in Python as a definition file; its other scenarios are not written."""
     from cirl_marl.definitions.writer import definition_of
 
-    text = definition_of(network)
+    text = definition_of(instance_of(Network, "network", network))
     write_atomically(Path(path), lambda partial: partial.write_text(text, encoding="utf-8"))
 
 

@@ -11,7 +11,7 @@ from cirl_marl.dynamics.adjoint import Adjoint, IntervalInputs
 from cirl_marl.dynamics.supply_adjoint import SupplyAdjoint
 from cirl_marl.environments.state import Interval
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import ControlError
+from cirl_marl.errors import ControlError, instance_of
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record
 
@@ -52,7 +52,8 @@ class Derivatives:
 
     def __init__(self, env: MultiAgentVectorEnv) -> None:
         """Compile the adjoint of ``env``; a ``CirlError`` says what of it has no derivative."""
-        self.env, self._adjoint = env, Adjoint(env.dynamics)
+        self.env = instance_of(MultiAgentVectorEnv, "env", env)
+        self._adjoint = Adjoint(env.dynamics)
         self._supply = SupplyAdjoint(env.supply, self._adjoint)
         self._table = env.layout.double_table()
 

@@ -57,7 +57,7 @@ class SingleAgentEnv(GymnasiumView):
         check_options(options, (*OPTIONS, "reward", "render_mode"), "agent", "scenario", "legacy_episode")
         if not isinstance(agent, str | None):
             raise CirlError(f"agent must be the name of one agent, got {agent!r}")
-        definition = load_network(network) if isinstance(network, str | Path) else network
+        definition = load_network(network)
         name = _scenario_of(definition, scenario, agent)
         agents = None if agent is None else [agent]
         super().__init__(NetworkParallelEnv(definition, scenario=name, agents=agents, **options))

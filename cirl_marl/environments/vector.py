@@ -116,10 +116,7 @@ class MultiAgentVectorEnv:
         Raises:
             CirlError: for an unknown network, scenario, agent or option.
         """
-        definition = load_network(network) if isinstance(network, str | Path) else network
-        if not isinstance(definition, Network):
-            raise CirlError(f"network must be a name of the catalogue, a file or a Network, got {definition!r}")
-        variant = definition.scenario(scenario)
+        variant = load_network(network, scenario=scenario)
         default = variant.episode.horizon
         for name, value in (("num_envs", num_envs), ("horizon", default if horizon is None else horizon)):
             if whole_number(name, value, 1) > MOST:

@@ -140,7 +140,7 @@ def account_front(
         CirlError: for input that cannot be used, or if all can be had at once, so that there is nothing to weigh.
         NoCertificate: for a network whose flows are not linear laws.
     """
-    definition = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
+    definition = load_network(network, scenario=scenario)
     _check_axes(definition, axes)
     points = whole_number("points", POINTS[len(axes)] if points is None else points, 3)
     others = [service.id for service in definition.services if service.id not in axes]

@@ -250,12 +250,11 @@ def compare(
         whole_number("episodes", episodes, 2)  # of fewer there is no confidence interval
     if network is None and scenario is not None:
         raise CirlError(f"scenario '{scenario}' goes with a network; runs have their own")
-    definition = load_network(network) if isinstance(network, str | Path) else network
     from cirl_marl.learners.interface import Trained  # it needs torch
 
     run_directories = [run if isinstance(run, RunDirectory) else RunDirectory(run) for run in runs]
     controls = controllers if "neutral" in controllers else ["neutral", *controllers]
-    variant = None if definition is None else definition.scenario(scenario)
+    variant = None if network is None else load_network(network, scenario=scenario)
     prices = None
     if uncertain_bound is not None:
         prices, numbers = uncertain_bound.prices, uncertain_bound.draws_numbers

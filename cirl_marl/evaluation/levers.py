@@ -143,7 +143,7 @@ def levers(
         NoCertificate: for a network that has no bound.
         CirlError: for input that cannot be used, or fewer than two levers.
     """
-    variant = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
+    variant = load_network(network, scenario=scenario)
     by_lever = _agents_by_lever(variant, groups or {})
     whole_number("most", most, 2)
     env = MultiAgentVectorEnv(variant, num_envs=1)

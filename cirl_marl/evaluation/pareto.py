@@ -107,7 +107,7 @@ def pareto_front(
     check_place(on, workers)
     whole_number("points", points, 2)
     whole_number("seeds", seeds, 1)
-    definition = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
+    definition = load_network(network, scenario=scenario)
     recipe_ = _without_service_price(load_recipe(recipe) if isinstance(recipe, str | Path) else recipe)
     if recipe_ is not None:
         _check_fit(definition, recipe_)

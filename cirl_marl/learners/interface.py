@@ -173,7 +173,7 @@ def prepare(
 ) -> Training:
     """Return the training that ``train`` would start with these arguments; nothing is trained and nothing written."""
     if recipe is None:
-        network = load_network(network) if isinstance(network, str | Path) else network
+        network = load_network(network)
         recipe = default_recipe(network.scenario(options.get("scenario")))
     full_recipe = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
     steps = full_recipe.run.steps if steps is None else whole_number("steps", steps, 1)

@@ -13,6 +13,7 @@ from typing import Any
 from cirl_marl.learners.checkpoint import observation_statistics
 from cirl_marl.learners.learner import Learner
 
+
 class Interpolation:
     """Learners whose policies move between those of other learners, at 0, and their own, at 1."""
 

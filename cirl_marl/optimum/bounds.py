@@ -353,8 +353,7 @@ def highest_service(network: Network) -> float:
 
 
 def _episode_network(network: str | Path | Network, scenario: str | None, horizon: int | None) -> Network:
-    definition = load_network(network) if isinstance(network, str | Path) else network
-    definition = definition.scenario(scenario)
+    definition = load_network(network, scenario=scenario)
     return definition if horizon is None else definition.with_options(episode={"horizon": horizon})
 
 

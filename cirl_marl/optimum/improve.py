@@ -19,6 +19,7 @@ import numpy as np
 
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.dynamics.integrator import Dynamics
+from cirl_marl.errors import instance_of
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
@@ -94,10 +95,11 @@ def improve_plan(
         enough: asked of each episode that is better than those before, whether to stop there.
         progress: called with the share of them that is solved; 1 when no more are needed.
     """
-    slopes = slopes_of(bound.actions.shape, Dynamics(bound.network))
+    network = instance_of(Bound, "bound", bound).network
+    slopes = slopes_of(bound.actions.shape, Dynamics(network))
     if slopes > MOST_SLOPES:
         return refine(bound, enough=enough, progress=progress)
-    starts = start_count(bound.network, slopes) if starts is None else starts
+    starts = start_count(network, slopes) if starts is None else starts
     trials = Trials(simulate_plan, lambda run, price: penalised_objective(bound, run, price), demand(bound))
     plans: list[Bound] = []
     for start, actions in enumerate(starting_actions(bound.actions, starts)):

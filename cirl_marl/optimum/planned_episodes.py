@@ -11,7 +11,7 @@ import numpy as np
 from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import EVALUATION_SEEDS, Rollout, rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, ControlError
+from cirl_marl.errors import CirlError, ControlError, instance_of
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.bounds import Bound
@@ -96,7 +96,7 @@ class Plan(Controller):
 
 def simulate_plan(bound: Bound) -> Rollout:
     """Return the episode that the plan of ``bound`` makes in the simulator."""
-    network = bound.network
+    network = instance_of(Bound, "bound", bound).network
     stores = [replace(n, initial=(x, x)) for n, x in zip(network.stores, bound.stock[0].tolist(), strict=True)]
     start_network = network.variant(nodes=(*stores, *network.nodes[len(stores) :]))
     env = MultiAgentVectorEnv(start_network, num_envs=1, agents=bound.agents or None)

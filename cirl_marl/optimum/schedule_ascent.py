@@ -56,7 +56,7 @@ def improve_schedule(
     Raises:
         CirlError: for networks without derivatives (``gradient``).
     """
-    network, derivatives = env.network, Derivatives(env)
+    derivatives, network = Derivatives(env), env.network
     schedule = stacked_schedule(env, actions).mean(axis=2)
     scale, weight = network.objective.circularity_scale, max(env.circularity_weight, 1e-6)
     prices = np.array([service.weight for service in network.services]) * (1.0 - weight) / weight

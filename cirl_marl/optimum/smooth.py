@@ -21,7 +21,7 @@ from scipy import sparse
 
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.environments.actuators import Actuators
-from cirl_marl.errors import CirlError
+from cirl_marl.errors import CirlError, instance_of
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum.bounds import Bound
 from cirl_marl.optimum.linearised import MOST_SLOPES, Slopes, jacobians, slopes_of, step_program
@@ -106,7 +106,7 @@ def smooth_plan(bound: Bound, *, progress: Callable[[float], None] = lambda shar
     Raises:
         CirlError: for a network so large that its Jacobians would have more than MOST_SLOPES entries.
     """
-    dynamics, distance = Dynamics(bound.network), Distance(bound)
+    dynamics, distance = Dynamics(instance_of(Bound, "bound", bound).network), Distance(bound)
     if slopes_of(bound.actions.shape, dynamics) > MOST_SLOPES:
         size = f"its Jacobians have {slopes_of(bound.actions.shape, dynamics):,} entries, more than {MOST_SLOPES:,}"
         raise CirlError(f"network '{bound.network.name}': plans cannot be made smooth, as {size}")

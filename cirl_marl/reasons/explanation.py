@@ -90,7 +90,7 @@ def explain(
             raise CirlError(f"explain: {unknown_name('part', part, possible)}")
     if run is None:
         assert not isinstance(source, RunDirectory)
-        network = (load_network(source) if isinstance(source, str | Path) else source).scenario(scenario)
+        network = load_network(source, scenario=scenario)
         half = 0.5 if network.disturbed else 1.0
         plain, report = network, part_of(progress, "shadow prices", 0.0, half)
         if network.disturbed:

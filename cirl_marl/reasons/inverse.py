@@ -158,7 +158,7 @@ def infer(
         raise CirlError(f"within {within!r} must be at least 0 and less than 1")
     whole_number("episodes", episodes, 1)
     stop = time.process_time() + seconds
-    network = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
+    network = load_network(network, scenario=scenario)
     sources = [plans] if isinstance(plans, str | Path | PlannedEpisode) else list(plans)
     if not sources:
         raise CirlError("infer: no plans were given")

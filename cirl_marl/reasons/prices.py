@@ -86,7 +86,7 @@ def shadow_prices(
 
     References: Boyd and Vandenberghe 2004, Convex Optimization, section 5.6.
     """
-    network = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
+    network = load_network(network, scenario=scenario)
     if min_service is None and network.services:
         min_service = WITHIN_REACH * highest_service(network)
     best = bound(network, initial, min_service=min_service, agents=agents)

@@ -18,7 +18,7 @@ import numpy as np
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.definitions.data_files import CsvRows, number_in
 from cirl_marl.definitions.reader import write_network
-from cirl_marl.errors import CirlError, unknown_name
+from cirl_marl.errors import CirlError, instance_of, unknown_name
 from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
@@ -54,7 +54,7 @@ def write_package(folder: str | Path, simulation: Simulation) -> Path:
     Raises:
         CirlError: if there is something at ``folder``.
     """
-    folder, network = Path(folder), simulation.network
+    folder, network = Path(folder), instance_of(Simulation, "simulation", simulation).network
     if folder.exists():
         raise CirlError(f"{folder}: exists; a data package is a folder of its own, so give another name")
     resources = []

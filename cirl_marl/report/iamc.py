@@ -21,7 +21,7 @@ import numpy as np
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.definitions.data_files import CsvRows, number_in
 from cirl_marl.dynamics.ledger import Ledger
-from cirl_marl.errors import CirlError, unknown_name
+from cirl_marl.errors import CirlError, instance_of, unknown_name
 from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.calendar import elapsed_time, in_years, year
@@ -42,7 +42,8 @@ def write_iamc(path: str | Path, simulations: Sequence[Simulation]) -> Path:
     Raises:
         CirlError: what ``iamc_years`` raises.
     """
-    years = iamc_years([(simulation.network, simulation.control) for simulation in simulations])
+    episodes = [instance_of(Simulation, "each of simulations", simulation) for simulation in simulations]
+    years = iamc_years([(simulation.network, simulation.control) for simulation in episodes])
     rows = [
         [*names, *values(simulation.rollout).tolist()]
         for simulation in simulations
