@@ -520,6 +520,14 @@ def test_any_title_can_be_written(text: str, tmp_path: Path) -> None:
     assert load_network(tmp_path / "metal.toml").title == text
 
 
+@pytest.mark.parametrize(("part", "is_store"), [(0.19, False), (0.21, True)])
+def test_what_keeps_a_fifth_is_a_store(part: float, is_store: bool, tmp_path: Path) -> None:
+    """With less it does not balance, and that is said."""
+    rows = [["Ore", "Use", "", "", 2000, 1.0, "t/year"], ["Use", "Dump", "", "", 2000, 1.0 - part, "t/year"]]
+    flows = read_flows(table(tmp_path / "flows.csv", rows))
+    assert Processes(flows).inferred_stores == (("Use",) if is_store else ())
+
+
 @pytest.mark.parametrize("name", ["metal.csv", "metal_changes.csv", "metal_regions.csv"])
 def test_nothing_is_written_over(name: str, tmp_path: Path) -> None:
     """A table that is imported keeps its numbers, though the data of the network would be called like it."""

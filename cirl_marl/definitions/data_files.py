@@ -75,7 +75,8 @@ def _blocks(subject: str, content: bytes) -> Iterator[tuple[Sequence[int], Seque
                 rows = [row for row in rows if row]
             yield lines, rows
     except (UnicodeDecodeError, csv.Error) as error:
-        raise CirlError(f"{subject}: is no CSV file in UTF-8: {error}; save it in UTF-8") from error
+        remedy = "; save it in UTF-8" if isinstance(error, UnicodeDecodeError) else ""
+        raise CirlError(f"{subject}: is no CSV file in UTF-8: {error}{remedy}") from error
 
 
 def _plain_blocks(content: bytes) -> Iterator[tuple[Sequence[int], Sequence[CsvRow]]]:

@@ -207,8 +207,8 @@ def _check_names(table: FlowTable, parts: Sequence[_Entries]) -> None:
     """Refuse processes that differ in the case of letters alone, and rows that lack a region where others have one."""
     names: dict[str, str] = {}
     for name in (end for pair in table.pairs for end in (pair.source, pair.target)):
-        if (other := names.setdefault(name.casefold(), name)) != name:
-            raise CirlError(f"{table.name}: '{other}' and '{name}' differ in case alone; write them alike")
+        if (first_name := names.setdefault(name.casefold(), name)) != name:
+            raise CirlError(f"{table.name}: '{first_name}' and '{name}' differ in case alone; write them alike")
     if "" in table.regions and len(table.regions) > 1:
         first = int(np.flatnonzero(table.places[0] == table.regions.index(""))[0])
         raise CirlError("{}, line {}: states no region, as others do".format(*_positions(parts)[first]))
@@ -422,8 +422,8 @@ def _unit(path: Path, units: Mapping[str, str], default_unit: str | None) -> str
     if stated_units and "" in units:
         raise CirlError(f"{units['']}: states no unit, as others do; write '{stated_units[0]}' if that is it")
     if stated_units and default_unit not in (None, stated_units[0]):
-        stated = f"'{stated_units[0]}' stands in {units[stated_units[0]]}"
-        raise CirlError(f"--unit {default_unit}: {stated}; leave out one of them")
+        place = units[stated_units[0]]
+        raise CirlError(f"--unit {default_unit}: '{stated_units[0]}' stands in {place}; leave out one of them")
     if not stated_units and default_unit is None:
         raise CirlError(f"{path}: states no unit; give one with --unit, such as kt/year")
     unit = stated_units[0] if stated_units else str(default_unit)

@@ -49,8 +49,8 @@ def names_text(names: Sequence[str], most: int = 8) -> str:
     >>> names_text(["mine", "use", "yard"], 2)
     '3 (mine, use, …)'
     """
-    listing = ", ".join([*names[:most], *(["…"] if len(names) > most else [])])
-    return f"{len(names)} ({listing})" if names else "0"
+    text = ", ".join([*names[:most], *(["…"] if len(names) > most else [])])
+    return f"{len(names)} ({text})" if names else "0"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,8 +77,8 @@ class Network(Specification):
           services: 1 (methane)
           episode: 120 intervals of 0.25 day
         """
-        episode, passing = self.episode, sum(not node.stores for node in self.nodes)
-        others = ", ".join(name for name in sorted(self.scenarios) if name != self.scenario_name)
+        episode, without = self.episode, sum(not node.stores for node in self.nodes)
+        scenarios = ", ".join(sorted(self.scenarios))
         counts = {"agents": self.agents, "services": [service.id for service in self.services]}
         counts |= {key: [part.id for part in getattr(self, key)] for key in ("accounts", "substances")}
         counts["disturbances"] = list(self.disturbances)
@@ -86,9 +86,9 @@ class Network(Specification):
         return "\n  ".join(
             [
                 f"{self.name}: {self.title}".removesuffix(": "),
-                f"scenario: {self.scenario_name}" + (f" (others: {others})" if others else ""),
+                f"scenario: {self.scenario_name}" + (f" (others: {scenarios})" if scenarios else ""),
                 f"material: {self.material}, in {self.mass_unit} and {self.time_unit}",
-                f"nodes: {len(self.nodes)}, of which {passing} without stock; arcs: {len(self.arcs)}",
+                f"nodes: {len(self.nodes)}, of which {without} without stock; arcs: {len(self.arcs)}",
                 *(f"{key}: {text}" for key, text in lists.items()),
                 f"episode: {episode.horizon} intervals of {episode.control_interval:g} {self.time_unit}",
             ]
