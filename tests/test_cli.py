@@ -90,22 +90,8 @@ def test_short_trainings_say_that_there_are_no_curves(
 ) -> None:
     """No empty picture is drawn, and the number of steps that would do is given."""
     Path("bottles.toml").write_text(guide(days=60))
-    assert (
-        run(
-            monkeypatch,
-            "train",
-            "bottles.toml",
-            "--recipe",
-            "independent_a2c",
-            "--steps",
-            "640",
-            "--out",
-            "run",
-            "--episodes",
-            "2",
-        )
-        == 0
-    )
+    training = "train bottles.toml --recipe independent_a2c --steps 640 --out run --episodes 2"
+    assert run(monkeypatch, *training.split()) == 0
     assert "no learning curves, as no episode ended: 32 copies need 1,920 steps" in capsys.readouterr().out
     assert {path.name for path in Path("run/pictures").iterdir()} == {"flows_before_after.png", "circularity.png"}
     monkeypatch.setattr(sys, "argv", [])

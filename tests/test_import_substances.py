@@ -63,6 +63,12 @@ def imported(tmp_path: Path, rows: Sequence[Row], **options: object) -> ImportRe
     return import_flows(table(tmp_path / "flows.csv", rows), tmp_path / "net.toml", roles=ROLES, **options)  # type: ignore[arg-type]
 
 
+def amounts_of(report: ImportReport) -> np.ndarray:
+    """Return what there is of substances in the flows, (substances, regions, years, pairs)."""
+    assert report.table.substances is not None
+    return report.table.substances.amounts
+
+
 def simulated(network: Network) -> tuple[np.ndarray, np.ndarray]:
     """Return flows, (steps, arcs), and substances in them, (steps, substances, arcs), without agents."""
     env = MultiAgentVectorEnv(network, num_envs=1)
@@ -112,8 +118,7 @@ def test_sources_that_give_different_things_become_several(tmp_path: Path) -> No
 def test_processes_mix_what_the_table_does_not_tell(tmp_path: Path) -> None:
     """Of which no outflow says anything: shares are enough. A 0 is told, and does not balance."""
     report = imported(tmp_path, sorting((4, "", "")))
-    assert report.table.substances is not None
-    np.testing.assert_allclose(report.table.substances.amounts[0, 0, 0], [4, 3.6, 0.4], rtol=1e-12)
+    np.testing.assert_allclose(amounts_of(report)[0, 0, 0], [4, 3.6, 0.4], rtol=1e-12)
     assert "transfer" not in (tmp_path / "net.toml").read_text()
     with pytest.raises(CirlError, match=r"'Sorter' \(2000, Copper\): 4 enter, 0 leave"):
         import_flows(table(tmp_path / "0.csv", sorting((4, 0, 0))), tmp_path / "zero.toml", roles=ROLES)
@@ -125,15 +130,13 @@ def test_mixing_goes_round_loops_and_is_little_trusted(tmp_path: Path) -> None:
     rows[1][:2], rows[1][4] = ["Sorter", "Works"], 110.0
     rows.append(["Works", "Product", 2000, "", 90, "kt/year", ""])
     report = imported(tmp_path, rows)
-    assert report.table.substances is not None
-    amounts = dict(zip(map(str, report.table.pairs), report.table.substances.amounts[0, 0, 0], strict=True))
+    amounts = dict(zip(map(str, report.table.pairs), amounts_of(report)[0, 0, 0], strict=True))
     assert amounts["'Works' to 'Product'"] == pytest.approx(3.6) and amounts["'Sorter' to 'Dump'"] == pytest.approx(0.4)
     assert amounts["'Works' to 'Sorter'"] == pytest.approx(0.04 * 20)
     rows.append(["Works", "Product", 2000, "Copper", 3.0, "kt/year", "1 %"])
     rows.append(["Works", "Sorter", 2000, "Copper", 1.0, "kt/year", "1 %"])
     again = import_flows(table(tmp_path / "2.csv", rows), tmp_path / "again.toml", roles=ROLES, reconcile=True)
-    assert again.table.substances is not None
-    amounts = dict(zip(map(str, again.table.pairs), again.table.substances.amounts[0, 0, 0], strict=True))
+    amounts = dict(zip(map(str, again.table.pairs), amounts_of(again)[0, 0, 0], strict=True))
     assert amounts["'Works' to 'Product'"] == pytest.approx(3.0, rel=0.01)
     assert amounts["'Sorter' to 'Dump'"] == pytest.approx(0.7, rel=0.05)  # of 0.6 too much half each, by 0.4 and 0.4
 
@@ -143,8 +146,7 @@ def test_stores_do_not_hand_on_what_the_table_does_not_tell(tmp_path: Path) -> N
     rows: list[Row] = [["Mine", "Use", 2000, s, v, "kt/year", ""] for s, v in (("", 10.0), ("Copper", 0.2))]
     rows.append(["Use", "Dump", 2000, "", 5.0, "kt/year", ""])
     report = imported(tmp_path, rows, stores=["Use"])
-    assert report.table.substances is not None
-    assert report.table.substances.amounts[0, 0, 0].tolist() == [0.2, 0.0]
+    assert amounts_of(report)[0, 0, 0].tolist() == [0.2, 0.0]
 
 
 def cascade(seed: int, years: int = 4) -> Network:
@@ -252,18 +254,16 @@ def test_regions_have_contents_of_their_own(tmp_path: Path) -> None:
         _, substances = simulated(network)
         np.testing.assert_allclose(substances[:, 0], np.array([[10.0, 4.0]] * 2) * part, rtol=1e-9)
     only = import_flows(path, tmp_path / "south.toml", roles=ROLES, stores=["Use"], regions=["South"])
-    assert only.table.substances is not None
-    assert only.table.substances.amounts[0, 0, 0].tolist() == pytest.approx([0.5, 0.2])
+    assert amounts_of(only)[0, 0, 0].tolist() == pytest.approx([0.5, 0.2])
 
 
 def test_a_small_reconciliation_by_hand(tmp_path: Path) -> None:
     """Of 4.4 kt that enter and 1 + 3 that leave, with 10 % each: Lagrange's multiplier is 0.4/Σσ²."""
     report = imported(tmp_path, sorting((4.4, 1, 3)), reconcile=True)
-    assert report.table.substances is not None
     variances = np.array([0.44, 0.1, 0.3]) ** 2
     price = 0.4 / variances.sum()
     closest = np.array([4.4, 1, 3]) + np.array([-1, 1, 1]) * price * variances
-    np.testing.assert_allclose(report.table.substances.amounts[0, 0, 0], closest, rtol=1e-9)
+    np.testing.assert_allclose(amounts_of(report)[0, 0, 0], closest, rtol=1e-9)
     assert report.reconciliation is not None and report.reconciliation.degrees == 2
     assert report.reconciliation.chi_square == pytest.approx(0.4**2 / variances.sum(), rel=1e-9)
     assert {change.substance for change in report.changes} == {"Copper"}
@@ -277,7 +277,6 @@ def test_contents_of_flows_that_are_adjusted_stay(tmp_path: Path) -> None:
     rows = sorting((4, 10 / 9, 30), "%")
     rows[0][4] = 110
     report = imported(tmp_path, rows, reconcile=True)
-    assert report.table.substances is not None
     flows = report.table.grid(report.table.values)[0, 0]
     variances = (0.1 * np.array([110.0, 90.0, 10.0])) ** 2
     np.testing.assert_allclose(
@@ -287,7 +286,7 @@ def test_contents_of_flows_that_are_adjusted_stay(tmp_path: Path) -> None:
     spread = (0.1 * measured) ** 2
     gap = measured[0] - measured[1:].sum()
     expected = measured + gap / spread.sum() * spread * np.array([-1, 1, 1])
-    np.testing.assert_allclose(report.table.substances.amounts[0, 0, 0], expected, rtol=1e-9)
+    np.testing.assert_allclose(amounts_of(report)[0, 0, 0], expected, rtol=1e-9)
 
 
 def test_amounts_stay_where_flows_are_adjusted(tmp_path: Path) -> None:
@@ -295,8 +294,7 @@ def test_amounts_stay_where_flows_are_adjusted(tmp_path: Path) -> None:
     rows = sorting((4, 1, 3))
     rows[0][4] = 110
     report = imported(tmp_path, rows, reconcile=True)
-    assert report.table.substances is not None
-    np.testing.assert_allclose(report.table.substances.amounts[0, 0, 0], [4, 1, 3], rtol=1e-12)
+    np.testing.assert_allclose(amounts_of(report)[0, 0, 0], [4, 1, 3], rtol=1e-12)
 
 
 def test_amounts_without_uncertainty_err_by_a_tenth(tmp_path: Path) -> None:
@@ -422,8 +420,7 @@ def test_reconciled_amounts_are_nearer_to_the_truth() -> None:
 def test_more_than_the_flow_is_brought_within_it(tmp_path: Path) -> None:
     """The dump of 10 kt takes no more than that of copper, however much is measured."""
     report = imported(tmp_path, sorting((14, 2, 13)), reconcile=True)
-    assert report.table.substances is not None
-    amounts = report.table.substances.amounts[0, 0, 0]
+    amounts = amounts_of(report)[0, 0, 0]
     assert amounts[2] == pytest.approx(10.0, rel=1e-9)
     assert amounts[0] == pytest.approx(amounts[1] + amounts[2], rel=1e-9)
 
@@ -490,8 +487,7 @@ def test_traces_are_separated_and_balance_as_what_there_is_most_of(tmp_path: Pat
     trace = [[*row[:3], "Tin", row[4] * 1e-9, *row[5:]] for row in sorting((5, 1, 3))[3:]]  # type: ignore[operator]
     both = table(tmp_path / "both_table.csv", [*sorting(), *trace])
     report = import_flows(both, tmp_path / "both.toml", roles=ROLES, reconcile=True)
-    assert report.table.substances is not None
-    ore, product, dump = report.table.substances.amounts[1, 0, 0]
+    ore, product, dump = amounts_of(report)[1, 0, 0]
     assert ore == pytest.approx(product + dump, rel=1e-9) and 4e-9 < ore < 5e-9
     assert {change.substance for change in report.changes} == {"Tin"}
 
@@ -533,9 +529,8 @@ def test_regions_and_years_tell_for_themselves(tmp_path: Path) -> None:
     without = [[*row[:-1], "C"] for row in plain[:3]]
     flows = table(tmp_path / "flows.csv", [*plain, *other, *without], header)
     report = import_flows(flows, tmp_path / "net.toml", roles=ROLES)
-    assert report.table.substances is not None
     expected = [[4.0, 3.6, 0.4], [4.0, 1.0, 3.0], [0.0, 0.0, 0.0]]
-    np.testing.assert_allclose(report.table.substances.amounts[0, :, 0], expected, rtol=1e-12)
+    np.testing.assert_allclose(amounts_of(report)[0, :, 0], expected, rtol=1e-12)
     alone = import_flows(flows, tmp_path / "alone.toml", roles=ROLES, regions=["C"])
     assert alone.table.substances is None
     later = [[*row[:2], 2001, *row[3:]] for row in sorting()[:3]]
