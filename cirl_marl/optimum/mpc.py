@@ -447,11 +447,11 @@ class MPC(Planner):
         task = self._task(planner, self._stock(copy), intervals, demands, last, later, is_outlook=is_outlook)
         rounds = 1 if self._follows else MOST_ROUNDS  # what contents come to no correction of the program foresees
         plan = planner.plan(task, last.basis(intervals) if last else None, self._replan, rounds)
-        keeps_budgets = self._drawn is None and bool(self._aims.budgets)
-        if keeps_budgets and demands.deficit is not None:  # idle supplies are planned in full, and may be short
-            demanded = np.clip(demands.deficit / len(intervals), 0.0, 1.0)
-            plan = planner.at_price(replace(plan, task=replace(plan.task, demand=demanded)), plan.task.price)
-        if (self._climbs or keeps_budgets) and not is_outlook and not self._follows:
+        has_budgets = self._drawn is None and bool(self._aims.budgets)
+        if has_budgets and demands.deficit is not None:  # idle supplies are planned in full, and may be short
+            demand = np.clip(demands.deficit / len(intervals), 0.0, 1.0)
+            plan = planner.at_price(replace(plan, task=replace(plan.task, demand=demand)), plan.task.price)
+        if (self._climbs or has_budgets) and not is_outlook and not self._follows:
             plan = self._climb(planner, plan, last)
         if is_outlook or self._drawn is not None:
             return plan
@@ -467,7 +467,7 @@ class MPC(Planner):
             ahead = plan.task.intervals.start - last.task.intervals.start
             places = np.minimum(np.arange(ahead, ahead + len(plan.actions)), len(last.actions) - 1)
             plan = planner.better_of(plan, [last.actions[places]] * len(planner.futures))
-            if not self._climbs and planner.is_kept(plan):
+            if not self._climbs and not planner.is_short(plan):
                 return plan
         climbs = [climb_window(future, plan.task, plan.actions, self._weight) for future in planner.futures]
         courses, prices = zip(*climbs, strict=True)

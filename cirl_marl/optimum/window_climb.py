@@ -91,5 +91,5 @@ def climb_window(
     services = np.zeros(len(demand)) if task.demand is None else task.price[budgets:]
     price = np.concatenate([services, task.price[:budgets] / (share * future.aims.sizes[:budgets])])
     better, price = climb(plan, trials, price, ROUNDS)
-    of_budgets = price[len(demand) :] * share * future.aims.sizes[:budgets]
-    return better.actions, np.append(of_budgets, price[: len(task.price) - budgets])
+    budget_price = price[len(demand) :] * share * future.aims.sizes[:budgets]
+    return better.actions, np.append(budget_price, price[: len(task.price) - budgets])

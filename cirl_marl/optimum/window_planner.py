@@ -549,9 +549,9 @@ class WindowPlanner:
         other = replace(plan, actions=actions[0], level=level, bookings=bookings, value=value)
         return replace(other, merit=self._merit(other, plan.task.price))
 
-    def is_kept(self, plan: WindowPlan) -> bool:
-        """Return whether a plan keeps budgets and services but for what no round would mend."""
-        return max(self._shortages(plan)) <= ROUGH_SHORTFALL
+    def is_short(self, plan: WindowPlan) -> bool:
+        """Return whether a plan lacks more of services, or exceeds budgets by more, than further steps are worth."""
+        return max(self._shortages(plan)) > ROUGH_SHORTFALL
 
     def at_price(self, plan: WindowPlan, price: Floats) -> WindowPlan:
         """Return a plan at another price of what is exceeded and lacks, shape (budgets + services,)."""

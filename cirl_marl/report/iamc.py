@@ -46,7 +46,7 @@ def write_iamc(path: str | Path, simulations: Sequence[Simulation]) -> Path:
     years = iamc_years([(simulation.network, simulation.control) for simulation in episodes])
     rows = [
         [*names, *values(simulation.rollout).tolist()]
-        for simulation in simulations
+        for simulation in episodes
         for names, values in _series(simulation.network, simulation.control)
     ]
     return write_table(Path(path), [*NAMES, *map(str, years)], rows)
