@@ -361,14 +361,14 @@ def test_valves_open_for_orders() -> None:
 def test_without_windows_the_plan_of_the_episode_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where no window is solved, MPC goes on as the plan of the episode says, which it has for its prices."""
     env = MultiAgentVectorEnv("copper_net", num_envs=1, horizon=12)
-    solve = MPC._solve_task
+    solve = MPC._plan
 
     def hindered(self: MPC, *arguments: Any, is_outlook: bool = False) -> WindowPlan:
         if not is_outlook:
             raise solver.SolverFailure("here")
         return solve(self, *arguments, is_outlook=is_outlook)
 
-    monkeypatch.setattr(MPC, "_solve_task", hindered)
+    monkeypatch.setattr(MPC, "_plan", hindered)
     controller = MPC(min_service=0.9, horizon=5)
     run = rollout(env, controller, seed=1)
     outlook = controller._outlooks[0]

@@ -7,7 +7,9 @@ from typing import Annotated, Any
 import numpy as np
 import pytest
 
-from cirl_marl import Account, Arc, Control, ControlKind, Episode, Law, Network, Node, Service, Substance
+from cirl_marl import MPC, Account, Arc, Control, ControlKind, Episode, Law, Network, Node, Service, Substance
+from cirl_marl.controllers.rollout import episode_start
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum import bound, improve, improve_plan, linearised, simulate_plan, solver
 from cirl_marl.optimum.linearised import StepProgram
@@ -161,6 +163,18 @@ def test_plans_solve_pooling_problems(name: str) -> None:
     assert -run.accounts[0, 0] == pytest.approx(problem.optimum, rel=1e-3)
     np.testing.assert_allclose(run.episode_levels[0], 1.0, atol=2e-4)
     assert (run.accounts[0, 1:] <= most * (1 + 1e-5)).all()
+
+
+@pytest.mark.medium
+def test_mpc_is_no_worse_than_the_plan_that_it_could_follow() -> None:
+    """Also beside budgets, where the optimum of the program alone leads to 400 of 600."""
+    problem = PROBLEMS["Haverly 2"]
+    budgets = {name: product.most for name, product in problem.products.items()}
+    env = MultiAgentVectorEnv(problem.network(), num_envs=1)
+    run = episode_start(env).play(env, MPC(aim="cost", at_most=budgets, min_service=1.0))
+    assert -run.accounts[0, 0] == pytest.approx(problem.optimum, rel=1e-3)
+    assert run.least_service[0] >= 1.0 - 2e-4
+    assert (run.accounts[0, 1:] <= np.array([*budgets.values()]) * (1 + 1e-5)).all()
 
 
 def test_a_leap_that_fails_is_not_made_smaller(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -74,7 +74,7 @@ def shortage_rows(
         present = supply.arcs[supply.is_present]
         is_known = reach.uncut[:, present].all(axis=1) & ~has_valve[network.donors[present]].any()
         holds = np.asarray(is_known, dtype=bool) & supply.arrives
-        demand, (low, high) = admissible.service_low[period, s], supply.range
+        demand, (low, high) = admissible.service_low[period, s], supply.orders
         most = _largest_shortage(admissible, supply, reach, initial, intervals, demand)
         room = high - low
         for k, first in enumerate(supply.arcs[0].tolist()):
@@ -97,7 +97,7 @@ class _Supply:
     stocks: Annotated[Integers, "of the service, of each component its own, shape (stocks,)"]
     arcs: Annotated[Integers, "of each component, shape (components, arcs)"]
     is_present: Annotated[NDArray[np.bool_], "whether there may be something of it, likewise"]
-    range: Annotated[Floats, "least and most that is asked of the whole of each, shape (2, steps, arcs), mass/time"]
+    orders: Annotated[Floats, "least and most that is asked of the whole of each, shape (2, steps, arcs), mass/time"]
     arrivals: Annotated[Floats, "least part of each that arrives, shape (steps, stocks, components, arcs)"]
 
     @classmethod
@@ -142,7 +142,7 @@ class _Supply:
         """Return the least sum of what arrives at each stock times its weight, shape (steps, stocks) → (steps,)."""
         by_component = np.einsum("ts,tsca->tca", weights, self.arrivals)
         by_arc = np.where(self.is_present, by_component, np.inf).min(axis=1)
-        return np.asarray((self.range[1] * by_arc).sum(axis=1))
+        return np.asarray((self.orders[1] * by_arc).sum(axis=1))
 
 
 def _largest_shortage(
