@@ -533,11 +533,11 @@ class WindowPlanner:
         """
         other = self.with_actions(plan, actions)
         if plan.task.has_to_serve:
-            for least, shortage in zip(self._shortages(plan), self._shortages(other), strict=True):
-                if shortage > least + ROUGH_SHORTFALL:
-                    return plan
-                if len(plan.task.limits) and least > max(shortage, NOTABLE) + ROUGH_SHORTFALL:
-                    return other
+            (lack, shortage), (new_lack, new_shortage) = self._shortages(plan), self._shortages(other)
+            if max(new_lack - lack, new_shortage - shortage) > ROUGH_SHORTFALL:
+                return plan
+            if len(plan.task.limits) and shortage - new_shortage > NOTABLE:
+                return other
         return other if other.merit > self._merit(plan, plan.task.price) else plan
 
     def with_actions(self, plan: WindowPlan, actions: Sequence[Floats]) -> WindowPlan:
@@ -551,18 +551,18 @@ class WindowPlanner:
 
     def is_short(self, plan: WindowPlan) -> bool:
         """Return whether a plan lacks more of services, or exceeds budgets by more, than further steps are worth."""
-        return max(self._shortages(plan)) > ROUGH_SHORTFALL
+        return self._shortages(plan)[1] > ROUGH_SHORTFALL
 
     def at_price(self, plan: WindowPlan, price: Floats) -> WindowPlan:
         """Return a plan at another price of what is exceeded and lacks, shape (budgets + services,)."""
         return replace(plan, task=replace(plan.task, price=price), merit=self._merit(plan, price))
 
     def _shortages(self, plan: WindowPlan) -> tuple[float, float]:
-        """Return the sum of what services lack, and that of the parts by which budgets are exceeded."""
+        """Return the sum of what services lack, and that with the parts by which budgets are exceeded."""
         task = plan.task
         lack = 0.0 if task.demand is None else np.maximum(0.0, task.demand - plan.level).sum()
         excess = np.maximum(0.0, plan.bookings.sum(axis=0) - task.limits).sum() if len(task.limits) else 0.0
-        return float(lack), float(excess)
+        return float(lack), float(lack + excess)
 
     def _merit(self, plan: WindowPlan, price: Floats) -> float:
         """Return the objective of a plan, less what it exceeds and lacks at a price, shape (budgets + services,)."""
