@@ -11,6 +11,7 @@ import pytest
 from scipy import sparse
 from small_networks import cycle
 
+from benchmarks.yearly import LIFETIMES, yearly_network
 from cirl_marl import (
     Arc,
     Control,
@@ -29,6 +30,8 @@ from cirl_marl.optimum import bound, improve, improve_plan, program, reach, simu
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.improve import penalised_objective, prices
 from cirl_marl.optimum.mpc import MPC
+from cirl_marl.optimum.options import starting_stocks
+from cirl_marl.optimum.program import Programs
 
 
 @pytest.mark.parametrize(("network", "merged"), [(load_network("steel_japan"), False), (cycle(), True)])
@@ -270,6 +273,28 @@ def test_simplex_is_tried_where_interior_points_do_not_do(
     monkeypatch.setattr(solver._ScaledProgram, "distance", lambda *_: distance)
     solver.solve(problem)
     assert tried == [*solver.SETTINGS][:count]
+
+
+@pytest.mark.medium
+def test_interior_points_alone_leave_good_multipliers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a generated cycle in merged pieces, where rows that presolve merges as parallel spoil them."""
+    monkeypatch.setattr(program, "LARGE", 7000)
+    admissible = Admissible.of(yearly_network(76, LIFETIMES).with_options(episode={"horizon": 6}))
+    problem = Programs(admissible, 2, None).program(starting_stocks(admissible.lifetimes, None), 0.9)
+    distances, distance = list[float](), solver._ScaledProgram.distance
+
+    def noted(*answer: Any) -> float:
+        distances.append(distance(*answer))
+        return distances[-1]
+
+    monkeypatch.setattr(solver._ScaledProgram, "distance", noted)
+    monkeypatch.setattr(solver, "BASIS_PROGRAM", 0)
+    assert solver.solve(problem).basis is None
+    assert len(distances) == 1 and distances[0] <= solver.OPTIMAL
+    first = dict(solver.INTERIOR_SETTINGS[0])
+    monkeypatch.setattr(solver, "INTERIOR_SETTINGS", ({**first, "presolve_rule_off": 0}, *solver.SETTINGS))
+    solver.solve(problem)
+    assert len(distances) > 2
 
 
 def test_without_hipo_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
