@@ -18,6 +18,7 @@ import cirl_marl
 from cirl_marl import CirlError, DefinitionError, MultiAgentVectorEnv, RecipeError, Trained
 from cirl_marl.definitions.catalogue import folder
 from cirl_marl.learners.algorithms import algorithms, parameter_mistakes, parameters_of
+from cirl_marl.learners.checkpoint import observation_statistics
 from cirl_marl.learners.interface import train
 from cirl_marl.learners.policies import DifferentiablePolicy
 from cirl_marl.learners.recipe import LearnerSettings, Match, Normalisation, Options, Recipe, Run, load_recipe
@@ -94,6 +95,24 @@ def test_what_hardly_varies_is_magnified_by_at_most_epsilon(engine: str, tmp_pat
         change = DifferentiablePolicy(policy)(torch.tensor(rows)).diff(dim=0)
         acted = np.diff(policy.model.predict(normalised, deterministic=True)[0], axis=0)
         assert change.detach().numpy() == pytest.approx(acted, abs=1e-6)
+
+
+def test_exact_gradients_magnify_nothing_that_hardly_varied() -> None:
+    """Set-points never vary, a mine's stock by a thousandth: 0.05 more moves no input of a policy by more than 0.5.
+
+    Observations are in parts of scales that are declared; the floor of a deviation is a tenth of these.
+    """
+    recipe = load_recipe("exact_gradients")
+    short = recipe.model_copy(update={"run": recipe.run.model_copy(update={"steps": 288, "episodes": 2})})
+    trained, least = train("copper_net", short, horizon=9), np.inf
+    for name, learner in trained.learners.items():
+        assert learner.normaliser is not None
+        rows = np.repeat(trained.env.reset(seed=0)[name][:1], 2, axis=0)
+        rows[1] += 0.05
+        normalised = np.asarray(learner.normaliser.normalize_obs(rows))
+        assert np.abs(normalised[1] - normalised[0]).max() <= 0.5 + 1e-6
+        least = min(least, float(np.sqrt(observation_statistics(learner.normaliser)["observation"].var).min()))
+    assert least < 1e-3
 
 
 @pytest.mark.parametrize(

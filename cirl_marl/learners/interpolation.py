@@ -15,18 +15,18 @@ from cirl_marl.learners.learner import Learner
 
 
 class Interpolation:
-    """Learners whose policies move between those of other learners, at 0, and their own, at 1."""
+    """Learners whose policies move between those of their origins, at 0, and their own, at 1."""
 
-    def __init__(self, learners: Mapping[str, Learner], others: Mapping[str, Learner]) -> None:
-        """Begin where the ``learners`` are; ``others`` have the same names and shapes, and are not needed later."""
+    def __init__(self, learners: Mapping[str, Learner], origins: Mapping[str, Learner]) -> None:
+        """Begin where the ``learners`` are; ``origins`` have the same names and shapes, and are not needed later."""
         self._learners = learners
-        self._ends = {name: (_numbers(others[name]), _numbers(learner)) for name, learner in learners.items()}
+        self._ends = {name: (_numbers(origins[name]), _numbers(learner)) for name, learner in learners.items()}
 
     def set(self, share: float) -> None:
-        """Give the learners a ``share`` of their own numbers and the rest of the others'; 1 is exact."""
+        """Give the learners a ``share`` of their own numbers and the rest of their origins'; 1 is exact."""
         for name, learner in self._learners.items():
-            other, own = self._ends[name]
-            numbers = {key: (1.0 - share) * other[key] + share * value for key, value in own.items()}
+            origin, end = self._ends[name]
+            numbers = {key: (1.0 - share) * origin[key] + share * value for key, value in end.items()}
             state = learner.model.policy.state_dict()
             learner.model.policy.load_state_dict({key: numbers[key] for key in state})
             for key, part in _moments(learner):

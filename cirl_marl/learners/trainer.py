@@ -373,8 +373,8 @@ class Training:
         if not self._rank(best)[0] or self._rank(last)[0]:
             return
         folder = run.acting_checkpoint
-        acting = {name: load_acting_learner(folder, group, env) for name, group in self.groups.items()}
-        between, low, high = Interpolation(self.learners, acting), 0.0, 1.0
+        origins = {name: load_acting_learner(folder, group, env) for name, group in self.groups.items()}
+        between, low, high = Interpolation(self.learners, origins), 0.0, 1.0
         for _ in range(HALVINGS):
             share = (low + high) / 2
             between.set(share)

@@ -44,6 +44,7 @@ class StackedInputs:
         self._members, self._device = members, device
         views = [learner.agent_env.view for learner in members]
         self.spaces: list[Any] = [view.action_space for view in views]
+        self._low, self._high = (_bound_rows([getattr(space, end) for space in self.spaces]) for end in ("low", "high"))
         rows, states = members[0].agent_env.num_envs, views[0].state_entries
         lengths = [spaces.flatdim(view.observation_space) - states for view in views]
         self.local, self.entries = max(lengths), max(lengths) + states
@@ -117,8 +118,9 @@ class StackedInputs:
 
     def hand_in(self, actions: Tensor) -> None:
         """Hand in actions, shape (N, B, entries), clipped to their bounds."""
-        for rows, learner, space in zip(actions.cpu().numpy(), self._members, self.spaces, strict=True):
-            learner.agent_env.step_async(np.clip(rows[:, : space.shape[0]], space.low, space.high))
+        moves = np.clip(actions.cpu().numpy(), self._low, self._high)  # all at once: a call each costs 5 µs
+        for rows, learner, space in zip(moves, self._members, self.spaces, strict=True):
+            learner.agent_env.step_async(rows[:, : space.shape[0]])
 
     def give(self) -> None:
         """Bring the normalisers of the learners up to date."""
@@ -158,6 +160,14 @@ class StackedInputs:
                 standard = (part - mean[:, None]) / np.sqrt(var + normaliser.epsilon)[:, None]
                 parts[place] = np.clip(standard, -normaliser.clip_obs, normaliser.clip_obs)
         return torch.as_tensor(np.concatenate(parts, axis=2), dtype=torch.float32, device=self._device)
+
+
+def _bound_rows(bounds: Sequence[NDArray[np.floating]]) -> NDArray[np.float32]:
+    """Return bounds of N learners with zeros after them, shape (N, 1, longest)."""
+    rows = np.zeros((len(bounds), 1, max(map(len, bounds))), dtype=np.float32)
+    for row, bound in zip(rows, bounds, strict=True):
+        row[0, : len(bound)] = bound
+    return rows
 
 
 def _enter(parts: Mapping[str, NDArray[np.floating]], i: int, observation: Any) -> None:
