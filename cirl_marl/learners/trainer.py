@@ -22,7 +22,6 @@ from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RecipeError, RunError, unknown_name
 from cirl_marl.learners.checkpoint import read_tree, write_tree
 from cirl_marl.learners.demonstrations import Demonstrator
-from cirl_marl.learners.interpolation import Interpolation
 from cirl_marl.learners.learner import Learner, derived_seed, has_tensorboard, load_acting_learner
 from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, Streams, TrainingStop
 from cirl_marl.learners.policies import Policies
@@ -32,6 +31,7 @@ from cirl_marl.learners.stacked.conditions import gradient_obstacle, gradient_st
 from cirl_marl.learners.stacked.stack import Stack, StackedPolicies
 from cirl_marl.learners.start import begin_again, begin_from
 from cirl_marl.learners.validation import Multipliers, Rank, Score, validation_score
+from cirl_marl.learners.weight_path import WeightPath
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import CIRCULARITY
 from cirl_marl.optimum.aims import aims_of
@@ -374,7 +374,7 @@ class Training:
             return
         folder = run.acting_checkpoint
         origins = {name: load_acting_learner(folder, group, env) for name, group in self.groups.items()}
-        between, low, high = Interpolation(self.learners, origins), 0.0, 1.0
+        between, low, high = WeightPath(self.learners, origins), 0.0, 1.0
         for _ in range(HALVINGS):
             share = (low + high) / 2
             between.set(share)

@@ -14,7 +14,7 @@ from cirl_marl.learners.checkpoint import observation_statistics
 from cirl_marl.learners.learner import Learner
 
 
-class Interpolation:
+class WeightPath:
     """Learners whose policies move between those of their origins, at 0, and their own, at 1."""
 
     def __init__(self, learners: Mapping[str, Learner], origins: Mapping[str, Learner]) -> None:
