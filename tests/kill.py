@@ -1,11 +1,13 @@
 """Trainings of every kind that are killed at random instants, taken up again, and compared with some that were not.
 
-python tests/kill.py 100      # so many SIGKILLs, from a new seed, which is printed; a second number is the seed
+python tests/kill.py 100           # so many SIGKILLs, from a new seed, which is printed; a second number is the seed
+python tests/kill.py 20 7 commands # SIGKILLs and Ctrl-C in turn, so many in all, of commands that write something
 """
 
 from __future__ import annotations
 
 import multiprocessing
+import os
 import random
 import shutil
 import signal
@@ -17,12 +19,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from command import guide
 from crowds import Shifts
 from stable_baselines3 import A2C, PPO
 from test_exact_resumption import CASES, files, recipe
+from test_import import cycle, table
 from test_teams import PAIR, SMALL
 
 import cirl_marl
+from cirl_marl.cli import main as command_line
 from cirl_marl.learners.interface import resume, train
 from cirl_marl.learners.run_directory import RunDirectory
 
@@ -101,6 +106,93 @@ def killed(case: str, folder: Path, draw: random.Random, lasts: float) -> Iterat
     run_to_end(case, folder)
 
 
+TRAIN = "train bottles.toml --recipe quick.toml --out run"
+COMMANDS = {
+    "import flows.csv --out metal.toml --reservoir Ore* --landfill Dump*": "",
+    "plan bottles.toml --control optimum --out plan.csv": "",
+    "simulate bottles.toml --control neutral --out simulated": "",
+    "pareto bottles.toml --points 3 --episodes 4 --out front": "",
+    "sweep sweep.toml --on here --out swept": "",
+    "compare run --controllers optimum --episodes 4 --out compared": TRAIN,
+    "report run --html page.html": TRAIN,
+    "export run --out exported": TRAIN,
+}
+"""Commands that write something, and what has to be there before."""
+TIMED = ("swept", ".xlsx", ".zip", "episodes.csv", "summary")
+"""Parts of the names of files in which times stand."""
+RECIPE = """name = "quick"\ntitle = "quick"\nrun = { steps = 200, envs = 2, evaluations = 2, episodes = 4 }
+[learner]\nalgorithm = "A2C"\nparameters = { n_steps = 5, policy_kwargs = { net_arch = [4] } }
+"""
+SWEEP = 'networks = ["bottles.toml"]\nrecipes = ["quick.toml"]\nseeds = [0, 1]\n[evaluation]\nepisodes = 4\n'
+
+
+def run_command(command: str, folder: Path) -> None:
+    """Run a command in a process group of its own; what it says goes to a file beside the folder."""
+    os.setpgrp()
+    os.chdir(folder)
+    output = os.open(folder.with_suffix(".log"), os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    for descriptor in (1, 2):
+        os.dup2(output, descriptor)
+    sys.argv = ["cirl", *command.split()]
+    command_line()
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return what is in the files of a folder, but for runs, of which ``main`` takes care."""
+    paths = (path for path in folder.rglob("*") if path.is_file() and path.relative_to(folder).parts[0] != "run")
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+
+def commands(count: int, seed: int) -> None:
+    """Kill commands; what is there then was there before or is whole, and the same command again ends as it would have.
+
+    Or it says that what it would write is there already, which is then whole.
+    """
+    draw, faults = random.Random(seed), 0
+    fork = multiprocessing.get_context("fork").Process
+    for number in range(count):
+        command, first = draw.choice([*COMMANDS.items()])
+        with tempfile.TemporaryDirectory() as scratch:
+            whole, again = (Path(scratch) / name for name in ("whole", "again"))
+            whole.mkdir()
+            (whole / "bottles.toml").write_text(guide())
+            (whole / "quick.toml").write_text(RECIPE)
+            (whole / "sweep.toml").write_text(SWEEP)
+            table(whole / "flows.csv", cycle())
+            for step in filter(None, (first, command)):
+                shutil.rmtree(again, ignore_errors=True)
+                shutil.copytree(whole, again)
+                began = time.perf_counter()
+                process = fork(target=run_command, args=(step, whole))
+                process.start()
+                process.join()
+                if process.exitcode:
+                    raise AssertionError(f"{step}: {whole.with_suffix('.log').read_text()}")
+            lasts, expected = time.perf_counter() - began, contents(whole)
+            process = fork(target=run_command, args=(command, again))
+            process.start()
+            time.sleep(draw.uniform(0.05, 1.0) * lasts)
+            os.kill(process.pid or 0, signal.SIGKILL if number % 2 else signal.SIGINT)
+            process.join()
+            left = contents(again)
+            half = [
+                name
+                for name, content in left.items()
+                if name in expected and content != expected[name] and not any(part in name for part in TIMED)
+            ]
+            last_words = again.with_suffix(".log").read_text()
+            process = fork(target=run_command, args=(command, again))
+            process.start()
+            process.join()
+            text, end = again.with_suffix(".log").read_text(), contents(again)
+            is_fine = not half and "Traceback" not in last_words + text and end.keys() == expected.keys()
+            is_fine &= process.exitcode == 0 or "exists" in text
+            faults += not is_fine
+            sys.stdout.write(f"{'ok' if is_fine else 'FAULT'}: {command}, {half or ''} {'' if is_fine else text}\n")
+            sys.stdout.flush()
+    sys.stdout.write(f"seed {seed}: {count} commands killed, {faults} faults\n")
+
+
 def main(count: int, seed: int) -> None:
     """Kill ``count`` trainings, of every kind in turn, and say how many ended with other bits."""
     draw, kills, saved, other, cases = random.Random(seed), 0, 0, 0, list[str]()
@@ -132,4 +224,4 @@ def main(count: int, seed: int) -> None:
 
 if __name__ == "__main__":
     chosen = int(sys.argv[2]) if len(sys.argv) > 2 else random.SystemRandom().randrange(10**6)
-    main(int(sys.argv[1]), chosen)
+    (commands if "commands" in sys.argv else main)(int(sys.argv[1]), chosen)

@@ -22,7 +22,7 @@ from cirl_marl.cli import app
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import episode_start
 from cirl_marl.importing.assembly import ImportReport, import_flows
-from cirl_marl.importing.balances import Processes, ProcessKind, _closest
+from cirl_marl.importing.balances import Change, Processes, ProcessKind, Reconciliation, _closest
 from cirl_marl.importing.definition import identifiers, shares_of
 from cirl_marl.importing.flow_table import Connection, FlowTable, read_flows, read_stocks
 from cirl_marl.network.elements import Role
@@ -491,7 +491,10 @@ def test_all_bad_rows_of_stocks_and_substances_are_named(tmp_path: Path) -> None
         read_stocks(path, "kt")
     first, second = str(refused.value).split("\n")
     assert "line 2: 3 of 'Use' is Cu" in first and "line 3: no row says what 'Use' holds in 2000" in second
-    flows = [["Ore", "Works", 2000, 1, "kt/year", ""], *[["Ore", "Elsewhere", 2000, 1, "%", e] for e in ("Cu", "Fe")]]
+    flows: list[Row] = [
+        ["Ore", "Works", 2000, 1, "kt/year", ""],
+        *[["Ore", "Elsewhere", 2000, 1, "%", e] for e in ("Cu", "Fe")],
+    ]
     path = table(tmp_path / "flows.csv", flows, ["source", "target", "year", "value", "unit", "substance"])
     with pytest.raises(CirlError) as refused:
         read_flows(path)
@@ -526,6 +529,27 @@ def test_what_keeps_a_fifth_is_a_store(part: float, is_store: bool, tmp_path: Pa
     rows = [["Ore", "Use", "", "", 2000, 1.0, "t/year"], ["Use", "Dump", "", "", 2000, 1.0 - part, "t/year"]]
     flows = read_flows(table(tmp_path / "flows.csv", rows))
     assert Processes(flows).inferred_stores == (("Use",) if is_store else ())
+
+
+@pytest.mark.parametrize(("mistake", "balances"), [(0.9e-6, True), (1.1e-6, False)])
+def test_tables_are_rounded(mistake: float, balances: bool, tmp_path: Path) -> None:
+    """To a millionth of the largest flow nothing is out of balance."""
+    rows = [["Ore", "Dump", "", "", 2000, 100.0, "t/year"], ["Ore", "Works", "", "", 2000, 1.0, "t/year"]]
+    rows += [["Works", "Dump", "", "", 2000, 1.0 - 100.0 * mistake, "t/year"]]
+    assert (not Processes(read_flows(table(tmp_path / "flows.csv", rows))).residuals) is balances
+
+
+def test_flows_that_were_moved_far_come_first() -> None:
+    """Those by more than two standard deviations."""
+    changes = tuple(Change("", 2000, Connection("a", "b"), 10.0, 10.0 + by, 1.0) for by in (1.9, -2.1, 3.0))
+    assert Reconciliation(changes, 1.0, 3).far == [changes[2], changes[1]]
+
+
+def test_scales_are_those_of_all_years(tmp_path: Path) -> None:
+    """A stock of the size of the largest flow in all years."""
+    import_flows(table(tmp_path / "flows.csv", cycle(years=3)), tmp_path / "metal.toml", roles=ROLES)
+    text = (tmp_path / "metal.toml").read_text()
+    assert "flow = { value = 14, unit" in text and "stock = { value = 42, unit" in text
 
 
 @pytest.mark.parametrize("name", ["metal.csv", "metal_changes.csv", "metal_regions.csv"])

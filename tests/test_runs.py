@@ -279,6 +279,8 @@ def test_failed_writing_leaves_the_old_file_and_no_other(tmp_path: Path) -> None
 
     with pytest.raises(OSError, match="disk full"):
         write_atomically(path, write)
+    with pytest.raises(OSError, match=r"No space left on device: '.*kept.txt'"):
+        write_atomically(path, lambda partial: Path("/dev/full").write_text(f"{partial.touch()}"))
     assert [each.name for each in tmp_path.iterdir()] == ["kept.txt"]
     assert path.read_text() == "old"
 
@@ -315,7 +317,12 @@ def test_the_file_that_names_the_others_comes_last(tmp_path: Path, monkeypatch: 
     """What is killed in between leaves no definition without its data."""
     moved: list[str] = []
     replace = os.replace
-    monkeypatch.setattr(os, "replace", lambda source, target: (moved.append(target.name), replace(source, target)))
+
+    def recorded(source: Path, target: Path) -> None:
+        moved.append(target.name)
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", recorded)
     with files_module.publish_folder(tmp_path, last="b.toml") as draft:
         for name in ("c.csv", "b.toml", "a.csv"):
             (draft / name).touch()
