@@ -549,7 +549,7 @@ def test_scales_are_those_of_all_years(tmp_path: Path) -> None:
     """A stock of the size of the largest flow in all years."""
     import_flows(table(tmp_path / "flows.csv", cycle(years=3)), tmp_path / "metal.toml", roles=ROLES)
     text = (tmp_path / "metal.toml").read_text()
-    assert "flow = { value = 14, unit" in text and "stock = { value = 42, unit" in text
+    assert "flow = { value = 13, unit" in text and "stock = { value = 38, unit" in text
 
 
 @pytest.mark.parametrize("name", ["metal.csv", "metal_changes.csv", "metal_regions.csv"])

@@ -175,17 +175,11 @@ def stem(network: Network, *more: str) -> str:
 
 
 def folder_for(path: Path, option: str) -> Path:
-    """Return ``path``, which is or can become a folder; a ``CirlError`` names the option if it is something else."""
+    """Return ``path``, which is or can become a folder; a ``CirlError`` names the option if it cannot be written to."""
     if path.exists() and not path.is_dir():
         raise CirlError(f"{option} {path}: is a file, not a folder")
+    _check_writable(path / "file", f"{option} {path}")
     return path
-
-
-def writable_folder(path: Path, option: str) -> Path:
-    """Return ``folder_for`` of a path; a ``CirlError`` says so as well if nothing can be written there."""
-    folder = folder_for(path, option)
-    _check_writable(folder / "file", f"{option} {path}")
-    return folder
 
 
 def page_for(path: Path | None) -> Path | None:

@@ -67,7 +67,7 @@ def simulate(
 
     if package is not None and (len(controls) > 1 or len(scenario or ()) > 1):
         raise CirlError("--package holds one episode: give one scenario and one control")
-    if package is not None and common.writable_folder(package, "--package").exists():
+    if package is not None and common.folder_for(package, "--package").exists():
         raise CirlError(f"--package {package}: exists; a data package is a folder of its own, so give another name")
     constants, folder = _constants(controls, set_ or []), common.folder_for(out or Path(), "--out")
     definition = load_network(network)

@@ -55,7 +55,7 @@ def explain(
     if out is None:
         stem = "" if is_run else common.stem(load_network(source, scenario=scenario))
         out = Path(source) / FOLDER if is_run else Path(f"reasons_{stem}")
-    folder = common.writable_folder(out, "--out")
+    folder = common.folder_for(out, "--out")
     options: dict[str, Any] = {"min_service": min_service, "episodes": episodes, "seed": seed, "top": top}
     chosen = None if parts is None else common.comma_separated(parts)
     with shares() as progress:
@@ -114,7 +114,7 @@ def infer(
             raise CirlError(f"--out {out}: needs the name of a .csv file")
         if out.is_dir():
             raise CirlError(f"--out {out}: is a folder, not a file")
-        common.writable_folder(out.parent, "--out")
+        common.folder_for(out.parent, "--out")
     kinds = KINDS if terms is None else common.comma_separated(terms)
     options: dict[str, Any] = {"scenario": scenario, "seed": seed, "episodes": episodes, "seconds": seconds}
     with common.bar("weighing") as progress:
