@@ -22,7 +22,7 @@ from benchmarks.yearly import yearly_network
 from cirl_marl import MPC, MultiAgentVectorEnv, Network, load_network
 from cirl_marl.controllers.rollout import episode_start
 from cirl_marl.optimum import bound, gap
-from cirl_marl.optimum.bounds import DEGREE
+from cirl_marl.optimum.options import DEGREE
 
 BUDGETS = ("steel_japan, emissions=2900", "steel_japan, emissions/year=127")
 """Networks with a budget, which is that of the episode or of each year: plans look to its end."""
