@@ -31,9 +31,13 @@ HighsOptions = Mapping[str, str | float]
 CLEANUP_ITERATIONS = 2000
 """Simplex iterations after interior points. Where these stop short, HiGHS goes on by simplex, without end in programs
 of 25 000 variables; after a crossover it takes a few."""
+PARALLEL_RULE = 1 << 13
+"""HiGHS's number of the rule of presolve that merges parallel rows and columns. Undone without a basis it leaves
+multipliers that may be wrong by orders of magnitude; without the rule none of 58 programs of generated cycles had such.
+"""
 SETTINGS: tuple[HighsOptions, ...] = (
     {"solver": "ipx", "simplex_iteration_limit": CLEANUP_ITERATIONS},
-    {"solver": "ipx", "run_crossover": "off"},
+    {"solver": "ipx", "run_crossover": "off", "presolve_rule_off": PARALLEL_RULE},
     {"solver": "ipx", "run_crossover": "off", "presolve": "off"},
     {"solver": "simplex", "presolve": "off"},
 )
@@ -43,14 +47,7 @@ Crossover, which finds a basis for later programs, and presolve fail now and the
 of a control interval, rows fix a stock several times over, and multipliers of merged rows go wrong. Interior points
 without them do not, and leave no basis.
 """
-PARALLEL_RULE = 1 << 13
-"""HiGHS's number of the rule of presolve that merges parallel rows and columns. Undone without a basis it leaves
-multipliers that may be wrong by orders of magnitude; without the rule none of 58 programs of generated cycles had such.
-"""
-INTERIOR_SETTINGS: tuple[HighsOptions, ...] = (
-    {"solver": "ipx", "run_crossover": "off", "presolve_rule_off": PARALLEL_RULE, "kkt_tolerance": 1e-6},
-    *SETTINGS,
-)
+INTERIOR_SETTINGS: tuple[HighsOptions, ...] = ({**SETTINGS[1], "kkt_tolerance": 1e-6}, *SETTINGS)
 """What is tried for a program of which multipliers have to prove something, from BASIS_PROGRAM variables on."""
 EXTRA = "highspy_extras"
 """Package that brings HiPO."""
