@@ -251,6 +251,7 @@ def test_what_nobody_can_change_is_bounded_by_what_happens(merged: bool) -> None
 @pytest.mark.parametrize("copper", [0.0, 0.2])
 def test_several_stocks_that_a_market_fills_lack_nothing_where_enough_arrives(copper: float) -> None:
     """What a market has is shared out, so that no flood dies out at once: 90 % of the service costs what all does."""
+    np.testing.assert_allclose(largest_shortages(town(copper=copper, life=1.5 * LIFE)), 0.0, atol=1e-6)
     network = town(copper=copper, life=4 * LIFE)
     pit = replace(network.arcs[1], control=flow(1e-6))
     network = replace(network, arcs=(network.arcs[0], pit, *network.arcs[2:]))

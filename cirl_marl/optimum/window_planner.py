@@ -532,9 +532,10 @@ class WindowPlanner:
         shape (intervals, entries), the first of which are the same in all.
         """
         other = self.with_actions(plan, actions)
+        tolerance = ROUGH_SHORTFALL * self._slack_count(plan.task)  # a climb ends where each lacks as little
         if plan.task.has_to_serve:
             (lack, shortage), (new_lack, new_shortage) = self._shortages(plan), self._shortages(other)
-            if max(new_lack - lack, new_shortage - shortage) > ROUGH_SHORTFALL:
+            if max(new_lack - lack, new_shortage - shortage) > tolerance:
                 return plan
             if len(plan.task.limits) and shortage - new_shortage > NOTABLE:
                 return other
