@@ -245,13 +245,13 @@ def test_a_plan_from_an_empty_stock_is_simulated() -> None:
     assert 0 < run.episode_levels[0, 0] <= 1
 
 
-@pytest.mark.parametrize("horizon", [None, 3])
+@pytest.mark.parametrize("horizon", [pytest.param(None, marks=pytest.mark.slow), 1])
 def test_mpc_tells_what_is_out_of_reach(horizon: int | None) -> None:
     """Ore is too scarce to dilute so many products, which no single content tells."""
     network = sorter(low=0.0, high=0.01)
     control = Control(kind=ControlKind.FLOW, low=0.0, neutral=1.0, high=2.0)
     arcs = tuple(replace(arc, control=control) if arc.id == "mined" else arc for arc in network.arcs)
-    network = replace(network, arcs=arcs)
+    network = replace(network, arcs=arcs).with_options(episode={"horizon": 2})
     with pytest.raises(CirlError, match=r"no actions reach a mean service level of 1 of 'products'"):
         bound(network, min_service=1.0)
     for demand, is_reached in ((1.0, False), (0.5, True)):

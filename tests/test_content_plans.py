@@ -583,7 +583,7 @@ def test_what_comes_after_a_window_prices_each_component() -> None:
     rows, layout, mixtures = future.dynamics.rows, future.layout, future.admissible.mixtures
     assert mixtures is not None
     start, actions = by_stage(network, rows, network.initial[0]), random.uniform(-0.5, 1.0, (2, 2))
-    stocks, flows = WindowSimulator(network, ()).run(start, actions)
+    stocks, flows = WindowSimulator(Dynamics(network), ()).run(start, actions)
     copper = flows[:, 4:]
     costs, prices = np.zeros((2, layout.size)), random.uniform(1.0, 2.0, (2, 4))
     for component, flow in enumerate((flows[:, :4] - copper, copper)):

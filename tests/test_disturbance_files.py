@@ -277,7 +277,7 @@ def test_a_scenario_may_have_a_disturbance_of_another_kind(tmp_path: Path, monke
     shown = CliRunner().invoke(app, ["show", str(path), "--scenario", "stops"])
     assert re.search(r"price +│ markov +│ +0.5 … 1 +│ now, by leak", shown.output)
     titles = list[str]()
-    monkeypatch.setattr("cirl_marl.report.samples.save_bands", lambda *_, title: titles.append(title))
+    monkeypatch.setattr("cirl_marl.report.samples.save_bands", lambda *_, title, **__: titles.append(title))
     command = ["simulate", str(path), "--samples", "2", "--steps", "2", "--out", str(tmp_path)]
     for options in ([], ["--scenario", "stops"]):
         assert CliRunner().invoke(app, [*command, *options]).exit_code == 0

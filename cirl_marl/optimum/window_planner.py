@@ -30,6 +30,7 @@ from typing import Annotated, Any
 import numpy as np
 from scipy import sparse
 
+from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.dynamics.ledger import Ledger
 from cirl_marl.environments.actuators import planned_deviation
 from cirl_marl.network import Floats, Integers, RowSum
@@ -146,8 +147,8 @@ class Future:
             admissible.lifetimes.cache = like.admissible.lifetimes.cache
             self._programs = Programs(admissible, degree, service_weight, layout=like.layout, cache=self.cache)
         self.layout: Layout = self._programs.layout
-        self._simulator = WindowSimulator(network, admissible.agents)
-        self.dynamics = self._simulator.dynamics
+        self.dynamics = Dynamics(network)
+        self._simulator = WindowSimulator(self.dynamics, admissible.agents)
         self._measure, self._whole = service_measures(network, self.dynamics)
         mixtures, self._arcs = admissible.mixtures, len(network.arcs)
         self._planned_arcs = np.arange(self._arcs) if mixtures is None else mixtures.arcs.ravel()

@@ -11,16 +11,12 @@ from cirl_marl.network import Floats, Network
 
 
 class WindowSimulator:
-    """The exact motion of one copy of a network under planned actions.
+    """The exact motion of one copy of a network under planned actions."""
 
-    Attributes:
-        dynamics: of the network.
-    """
-
-    def __init__(self, network: Network, agents: tuple[str, ...]) -> None:
-        """Compile the network for ``agents``, who act."""
-        self.dynamics = Dynamics(network)
-        self._actuators, self._supply = Actuators(network, agents or None, 1), Supply(self.dynamics)
+    def __init__(self, dynamics: Dynamics, agents: tuple[str, ...]) -> None:
+        """Compile what ``agents`` do, who act."""
+        self._dynamics, self._supply = dynamics, Supply(dynamics)
+        self._actuators = Actuators(dynamics.network, agents or None, 1)
         self._idle = self._supply.idle(self._actuators.agents)
 
     def run(self, stock: Floats, actions: Floats, first: int = 0) -> tuple[Floats, Floats]:
@@ -35,7 +31,7 @@ class WindowSimulator:
             Stocks, shape (intervals + 1, rows), mass, and flows, of all and then of each substance, shape (intervals,
             components · arcs), mass/time.
         """
-        dynamics, inner = self.dynamics, np.empty((0, 1))
+        dynamics, inner = self._dynamics, np.empty((0, 1))
         masses, stocks, flows = dynamics.extend(stock[:, None]), [stock], []
         for step, action in enumerate(actions, first):
             interval = np.array([step])
