@@ -17,6 +17,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import numpy as np
@@ -67,7 +68,8 @@ def fitting(first: int) -> Iterator[tuple[int, Network]]:
 def measured(seed: int, network: Network, recipe: str) -> dict[str, Any]:
     """Train, and return what the acting checkpoint reaches."""
     begun = time.process_time()
-    training = train(network, recipe, seed=1)
+    with TemporaryDirectory() as folder:  # as users train: policies of kept runs are averaged at the end
+        training = train(network, recipe, seed=1, directory=Path(folder) / "run")
     seconds, score = time.process_time() - begun, training.best
     demanded = training.config.recipe.run.min_service
     assert isinstance(score, Score) and demanded is not None
