@@ -199,6 +199,13 @@ def test_plans_are_compared_by_what_they_exceed() -> None:
     merits = [merit(over, np.array([factor, 0.0])) for factor in (0.0, 1.0, 3.0)]
     np.testing.assert_allclose(np.diff(merits), [-0.05, -0.1])
     assert merits[0] == plan.value
+    better_of = control._planner.better_of
+    over = replace(over, task=replace(over.task, price=np.array([1.0, 0.0])))
+    for excess, is_left in ((0.02, True), (1e-4, False)):  # what exceeds by much less takes the place of what is dearer
+        dirty = replace(over, bookings=plan.bookings + excess / len(plan.bookings), value=plan.value + 10.0)
+        assert (better_of(dirty, [plan.actions]).value == pytest.approx(plan.value)) == is_left
+        served = replace(dirty, level=plan.level + 0.01, task=replace(dirty.task, demand=plan.level + 0.01))
+        assert better_of(served, [plan.actions]) is served  # but no service is given for it
     future = control._planner.futures[0]
     charged = replace(plan.task, charges=np.array([50.0]))
     values = [future.carry_out(task, plan.actions).value for task in (plan.task, charged)]
