@@ -49,6 +49,7 @@ from cirl_marl.optimum.linearised import jacobians, step_program
 from cirl_marl.optimum.options import by_stage, with_margin
 from cirl_marl.optimum.program import LARGE, Programs
 from cirl_marl.optimum.solver import solve
+from cirl_marl.optimum.window_climb import climb_window
 from cirl_marl.optimum.window_planner import Future
 from cirl_marl.optimum.window_simulator import WindowSimulator
 from cirl_marl.optimum.windows import Continuation, WindowTask
@@ -413,6 +414,19 @@ def test_levels_of_contents_in_windows_are_those_of_the_simulator() -> None:
     np.testing.assert_allclose(np.minimum(outcome.level, 1.0), levels, rtol=1e-9)
     assert outcome.level[0, 1] == 1.0 and len(np.unique(levels[:, 1])) >= 3
     assert (future.carry_out(task, actions, np.full((6, 2), 2.0)).level[:, 1] > 1.0).any()
+
+
+def test_windows_leave_what_comes_later_as_it_was() -> None:
+    """Of a climb the first intervals alone move, if no more are free."""
+    network = sorter(low=0.0, high=0.02)
+    future = Future(Admissible.of(network), 2, None)
+    start = by_stage(network, future.dynamics.rows, network.initial[0])
+    task = WindowTask(start, range(6), np.ones(2), None, np.ones(2), None)
+    actions = np.full((6, 2), -0.5)
+    for free in (1, 3):
+        better, _ = climb_window(future, task, actions, None, free)
+        np.testing.assert_array_equal(better[free:], actions[free:])
+        assert (better[:free] != actions[:free]).any(axis=1).all()
 
 
 def test_plans_tell_what_contents_are_worth() -> None:
