@@ -274,6 +274,21 @@ def test_several_stocks_lack_no_more_after_a_flood(high: float, sorts: bool, cop
     assert room(network, actions).min() >= 0
 
 
+def test_stocks_without_lifetimes_have_a_floor_too_but_not_beside_lifetimes() -> None:
+    """Of a mixture all that is demanded may lack; of two rates what is left at the faster one, and rows hold."""
+    network = town(14.0, copper=0.0)
+    mixed, plain = network, network
+    for name, mean in (("sheds", 0.6 * LIFE), ("homes", LIFE)):
+        mixed = plain
+        nodes = tuple(replace(node, lifetime=None, rate=1 / mean) if node.id == name else node for node in plain.nodes)
+        plain = replace(plain, nodes=nodes)
+    np.testing.assert_allclose(largest_shortages(mixed), DEMAND, rtol=1e-9)
+    assert 0 < largest_shortages(plain).max() < DEMAND
+    actions = np.full((YEARS, 1, YEARS), -1.0)
+    actions[np.arange(YEARS), 0, np.arange(YEARS)] = 1.0
+    assert room(plain, actions).min() >= 0
+
+
 def test_nothing_is_said_where_a_source_may_run_dry_or_a_route_be_closed() -> None:
     """There a stock may lack while its arc supplies less than the most."""
     assert rows_of(village(9.0, ore=30.0))[1].toarray().any(axis=1).sum() < YEARS
