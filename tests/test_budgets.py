@@ -28,8 +28,9 @@ from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.network.disturbances import AutoRegression, DisturbanceEffect
 from cirl_marl.optimum import Bound, bound, improve, improve_plan, simulate_plan, smooth, smooth_plan
 from cirl_marl.optimum.aims import Aims, Budget
-from cirl_marl.optimum.linearised import StepProgram, jacobians, step_program
+from cirl_marl.optimum.linearised import StepProgram, step_program
 from cirl_marl.optimum.program import Programs
+from cirl_marl.optimum.slopes import jacobians
 from cirl_marl.optimum.solver import Basis
 from cirl_marl.optimum.window_planner import WindowPlanner
 from cirl_marl.optimum.windows import WindowPlan, WindowTask
@@ -311,8 +312,8 @@ def small_step(solved: Bound, level: float) -> tuple[Bound, StepProgram, NDArray
     prices = np.ones(services + len(solved.aims.limits))
     program = step_program(middle, dynamics, run, np.full(services, level), prices, 0.1, jacobians(middle, dynamics))
     moves = np.zeros(len(program.origin))
-    moves[program.action] = 1e-4 * rng.uniform(-1, 1, program.action.shape)
-    trial = simulate_plan(replace(middle, actions=middle.actions + moves[program.action]))
+    moves[program.columns.action] = 1e-4 * rng.uniform(-1, 1, program.columns.action.shape)
+    trial = simulate_plan(replace(middle, actions=middle.actions + moves[program.columns.action]))
     return middle, program, moves, run, trial
 
 
@@ -330,7 +331,7 @@ def test_a_step_of_a_plan_knows_what_it_books() -> None:
     assert row @ moves == pytest.approx(books[1], rel=1e-3)
     assert program.problem.under_to[-1] == pytest.approx(3000.0 - run.accounts[0, 1])
     moves *= 3000.0
-    trial = simulate_plan(replace(middle, actions=np.clip(middle.actions + moves[program.action], -1.0, 1.0)))
+    trial = simulate_plan(replace(middle, actions=np.clip(middle.actions + moves[program.columns.action], -1.0, 1.0)))
     corrected = program.with_correction(moves, run, trial)
     assert corrected.problem.under_to[-1] == pytest.approx(3000.0 - trial.accounts[0, 1] + row @ moves, rel=1e-9)
 

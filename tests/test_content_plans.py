@@ -45,9 +45,10 @@ from cirl_marl.network.uncertainty import Spread
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.aims import aims_of
 from cirl_marl.optimum.draw_proofs import Sampling
-from cirl_marl.optimum.linearised import jacobians, step_program
+from cirl_marl.optimum.linearised import step_program
 from cirl_marl.optimum.options import by_stage, with_margin
 from cirl_marl.optimum.program import LARGE, Programs
+from cirl_marl.optimum.slopes import jacobians
 from cirl_marl.optimum.solver import solve
 from cirl_marl.optimum.window_climb import climb_window
 from cirl_marl.optimum.window_planner import Future
@@ -522,7 +523,7 @@ def test_corrections_of_steps_leave_contents_out() -> None:
     slopes, services = jacobians(solution, dynamics), len(solution.network.services)
     program = step_program(solution, dynamics, run, np.ones(services), np.ones(services), 0.5, slopes)
     values = np.zeros(len(program.scale))
-    values[program.action] = 0.1
+    values[program.columns.action] = 0.1
     trial = simulate_plan(replace(solution, actions=np.clip(solution.actions - 0.4, -1.0, 1.0)))
     corrected, rows = program.with_correction(values, run, trial), program.measured[:, 1]
     change = corrected.problem.under_to[: len(rows)] - program.problem.under_to[: len(rows)]

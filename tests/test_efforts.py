@@ -45,7 +45,7 @@ from cirl_marl.network.disturbances import DisturbanceEffect, Markov
 from cirl_marl.network.uncertainty import Spread
 from cirl_marl.optimum import improve_plan, simulate_plan
 from cirl_marl.optimum.draw_proofs import Sampling
-from cirl_marl.optimum.linearised import ActionPlan
+from cirl_marl.optimum.slopes import ActionPlan
 from cirl_marl.optimum.step_parts import Efforts
 from cirl_marl.report.account_tables import accounts_table
 
@@ -337,15 +337,15 @@ def test_steps_of_plans_know_the_kinks() -> None:
     network = replace(network, services=(service,))
     solved = bound(network, aim="cost", min_service=0.1)
     middle, program, moves, run, _ = small_step(solved, 0.1)
-    assert program.part.shape == (5, 1)
+    assert program.columns.part.shape == (5, 1)
     for share in (0.5, 2.0):
         target = middle.actions + share * (-0.5 - middle.actions)  # −0.5 is neutral
         trial = simulate_plan(replace(middle, actions=np.clip(target, -1.0, 1.0)))
         changes = np.abs(np.clip(target, -1, 1) + 0.5) - np.abs(middle.actions + 0.5)
-        moves[program.action], moves[program.part] = np.clip(target, -1, 1) - middle.actions, changes
+        moves[program.columns.action], moves[program.columns.part] = np.clip(target, -1, 1) - middle.actions, changes
         assert program.problem.cost @ moves == pytest.approx(trial.accounts[0, 0] - run.accounts[0, 0], abs=1e-9)
         inside = program.problem.under @ moves - program.problem.under_to
-        rows = abs(program.problem.under[:, program.part.ravel()]).sum(axis=1) > 0
+        rows = abs(program.problem.under[:, program.columns.part.ravel()]).sum(axis=1) > 0
         assert (inside[rows] <= 1e-9).all() and inside[rows].max() == pytest.approx(0.0, abs=1e-9)
 
 

@@ -231,13 +231,13 @@ def test_steps_of_plans_have_what_pieces_change_by() -> None:
         distance = abs(1.0 + actions.T - 0.5)
         return ledger.convex_parts(episode.flow.T, (stock[1:] + stock[:-1]).T / 2, distance).T
 
-    changes = parts(middle.actions + moves[program.action], trial) - parts(middle.actions, run)
-    moves[program.part] = changes
+    changes = parts(middle.actions + moves[program.columns.action], trial) - parts(middle.actions, run)
+    moves[program.columns.part] = changes
     books = trial.accounts[0, 0] - run.accounts[0, 0]
-    assert program.part.shape == (5, 4) and abs(changes).max(axis=0).all()
+    assert program.columns.part.shape == (5, 4) and abs(changes).max(axis=0).all()
     assert program.problem.cost @ moves == pytest.approx(books, rel=1e-5)
     room = program.problem.under_to - program.problem.under @ moves
-    rows = abs(program.problem.under[:, program.part[:, 1:].ravel()]).sum(axis=1) > 0
+    rows = abs(program.problem.under[:, program.columns.part[:, 1:].ravel()]).sum(axis=1) > 0
     assert room[rows].min() >= -1e-8 and (room[rows] < 1e-8).sum() >= 4
     assert (moves >= program.problem.low - 1e-9).all() and (moves <= program.problem.high + 1e-9).all()
 
@@ -248,7 +248,7 @@ def test_excesses_of_a_step_are_measured_by_their_amounts() -> None:
     program = small_step(bound(network, aim="cost", min_service=0.5), 0.5)[1]
     amounts = Ledger(network).amounts
     assert sorted(set(amounts.ravel().tolist())) == [20.0, 40.0, 50.0, 80.0]
-    np.testing.assert_array_equal(program.scale[program.part], np.tile(amounts.T, (STEPS, 1)))
+    np.testing.assert_array_equal(program.scale[program.columns.part], np.tile(amounts.T, (STEPS, 1)))
 
 
 def test_a_step_leaves_rates_as_they_are() -> None:

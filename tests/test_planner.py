@@ -34,9 +34,10 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network import Floats
 from cirl_marl.network.elements import Lifetime
 from cirl_marl.optimum import NoCertificate, Plan, bound, improve, improve_plan, program, search, simulate_plan, solver
-from cirl_marl.optimum.linearised import StepProgram, jacobians, step_program
+from cirl_marl.optimum.linearised import StepProgram, step_program
 from cirl_marl.optimum.mpc import MPC
 from cirl_marl.optimum.planned_episodes import starting_states
+from cirl_marl.optimum.slopes import jacobians
 from cirl_marl.optimum.window_planner import WindowPlanner
 from cirl_marl.optimum.windows import WindowPlan, WindowTask
 
@@ -113,9 +114,10 @@ def test_the_program_of_a_step_is_the_episode_to_first_order(lives: bool) -> Non
 
     def after(program: StepProgram, step: Floats) -> tuple[Rollout, Floats, Floats]:
         values = program.origin.copy()
-        values[program.action] = step
+        action = program.columns.action
+        values[action] = step
         trial = simulate_plan(replace(found, actions=found.actions + step))
-        moved = -(program.problem.under @ np.where(np.isin(np.arange(len(values)), program.action), values, 0.0))
+        moved = -(program.problem.under @ np.where(np.isin(np.arange(len(values)), action), values, 0.0))
         return trial, values, moved[: len(program.measured)]
 
     rng = np.random.default_rng(1)
@@ -124,13 +126,13 @@ def test_the_program_of_a_step_is_the_episode_to_first_order(lives: bool) -> Non
         step = size * rng.uniform(-1, 1, found.actions.shape)
         trial, values, promised = after(program, step)
         place, row = program.measured.T
-        read = [np.concatenate([each.stock, each.flow], axis=1) @ program.measure.T for each in (run, trial)]
+        read = [np.concatenate([each.stock, each.flow], axis=1) @ program.measures.table.T for each in (run, trial)]
         change = (read[1] - read[0])[place, row]
         assert set(row.tolist()) == {0, 1, 2} and len(place) > 10
         if accuracy is not None:
             np.testing.assert_allclose(promised, change, rtol=0, atol=accuracy * np.abs(change).max())
             gain = float(trial.episode_circularity[0] - run.episode_circularity[0])
-            cost = program.problem.cost[program.action]
+            cost = program.problem.cost[program.columns.action]
             assert -(cost * step).sum() == pytest.approx(gain, rel=2e-3)
         moved = program.with_correction(values, run, trial).problem.under_to - program.problem.under_to
         np.testing.assert_allclose(promised + moved[: len(place)], change, atol=1e-9 * np.abs(read[0]).max())
@@ -180,7 +182,8 @@ def test_the_best_of_a_round_counts_and_what_it_lacks_is_asked_for(monkeypatch: 
         return SimpleNamespace(worth=worth, episode_levels=levels, accounts=nothing, bookings=nothing[..., None])
 
     class Step(SimpleNamespace):
-        problem, scale, action = None, None, np.arange(found.actions.size).reshape(found.actions.shape)
+        problem, scale = None, None
+        columns = SimpleNamespace(action=np.arange(found.actions.size).reshape(found.actions.shape))
 
         def promise(self, values: Floats) -> float:
             return 1.0

@@ -29,7 +29,7 @@ from cirl_marl import (
     simulate_plan,
     smooth_plan,
 )
-from cirl_marl.optimum import linearised, open_loop
+from cirl_marl.optimum import open_loop, slopes
 from cirl_marl.optimum.bounds import Bound
 from cirl_marl.optimum.smooth import TOLERANCE, Distance
 
@@ -128,4 +128,4 @@ def test_who_asks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cirl_marl.optimum.smooth.MOST_SLOPES", 10)
     with pytest.raises(CirlError, match="'store': plans cannot be made smooth, as its Jacobians have 45 entries"):
         plan(network, "optimum", smooth=True)
-    assert linearised.MOST_SLOPES > 10
+    assert slopes.MOST_SLOPES > 10

@@ -30,7 +30,7 @@ from cirl_marl.controllers.rollout import rollout
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.network import Floats
 from cirl_marl.optimum import Bound, bound, improve, improve_plan, simulate_plan
-from cirl_marl.optimum.linearised import jacobians
+from cirl_marl.optimum.slopes import jacobians
 from cirl_marl.optimum.step_supplies import IdleSupplies
 
 AGENTS = ("recycle", "exports")
@@ -265,7 +265,8 @@ def test_the_plan_that_is_least_short_counts(monkeypatch: pytest.MonkeyPatch) ->
         over, worth = np.array([excess[action]]), 20 * (action > 0.1)
         return SimpleNamespace(episode_levels=np.zeros((1, 0)), excess=over, worth=worth)
 
-    step = SimpleNamespace(problem=None, scale=None, action=np.array([[0]]), promise=lambda values: 1.0)
+    columns = SimpleNamespace(action=np.array([[0]]))
+    step = SimpleNamespace(problem=None, scale=None, columns=columns, promise=lambda values: 1.0)
     step.with_correction = lambda *about: step
     slopes = SimpleNamespace(supplies=SimpleNamespace(services=()))
     monkeypatch.setattr(improve, "jacobians", lambda *about: slopes)

@@ -23,20 +23,13 @@ from cirl_marl.errors import instance_of
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
-from cirl_marl.optimum.aims import Aims, RateTables
+from cirl_marl.optimum.aims import Aims
 from cirl_marl.optimum.bounds import Bound
-from cirl_marl.optimum.linearised import (
-    MOST_SLOPES,
-    ActionPlan,
-    Later,
-    StepProgram,
-    jacobians,
-    slopes_of,
-    step_program,
-)
+from cirl_marl.optimum.linearised import ALL, Span, StepProgram, step_program
 from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.planned_episodes import simulate_plan
 from cirl_marl.optimum.program import Programs
+from cirl_marl.optimum.slopes import MOST_SLOPES, ActionPlan, jacobians, slopes_of
 from cirl_marl.optimum.solver import Infeasible, SolverFailure, best_values, solve
 
 P = TypeVar("P", bound=ActionPlan)
@@ -142,12 +135,7 @@ class Trials:
         Callable[[Any, Floats], float], "(episode, prices) → objective reached, less the price of what lacks"
     ]
     demand: Annotated[Floats, "mean level of each service, 0 for none, shape (services,)"]
-    first: Annotated[int, "interval of the network in which plans begin"] = 0
-    later: Annotated[Later | None, "what is worth after them; None if nothing comes after"] = None
-    rates: Annotated[
-        tuple[RateTables, RateTables] | None, "of accounts, and of budgets, over the intervals; None: the network's"
-    ] = None
-    free: Annotated[int | None, "how many of the first intervals may change; None: all"] = None
+    span: Annotated[Span, "these intervals"] = ALL
 
 
 def climb(
@@ -191,20 +179,12 @@ def climb(
                 value, trust = trials.value(run, price), TRUST
         if trust < SMALLEST or enough(run):
             break
-        slopes = jacobians(best, dynamics, trials.first) if slopes is None else slopes
+        slopes = jacobians(best, dynamics, trials.span.first) if slopes is None else slopes
         wanted, limits = np.minimum(demand + lack, 1.0), aims.limits - excess
         steps = list[_Step | None]()
         for is_held in (False, True) if len(slopes.supplies.services) else (False,):
-            program = step_program(
-                *(best, dynamics, run, wanted, price, trust, slopes),
-                limits=limits,
-                is_leap=is_leap,
-                first=trials.first,
-                later=trials.later,
-                rates=trials.rates,
-                is_held=is_held,
-                free=trials.free,
-            )
+            around = best, dynamics, run, wanted, price, trust, slopes
+            program = step_program(*around, limits=limits, span=trials.span, is_leap=is_leap, is_held=is_held)
             steps.append(_corrected_step(program, best, run, trials, price, value))
         progress(min((done + 1) / rounds, 1.0))
         step = max(filter(None, steps), key=lambda step: step.gain, default=_Step(best, run, 0.0))
@@ -245,7 +225,7 @@ def _corrected_step(
             break
         if corrected is program and program.promise(values) <= NO_PROMISE * abs(value):
             return None
-        candidate = _with_actions(plan, np.clip(plan.actions + values[program.action], -1.0, 1.0))
+        candidate = _with_actions(plan, np.clip(plan.actions + values[program.columns.action], -1.0, 1.0))
         trial = trials.simulate(candidate)
         gain = trials.value(trial, price) - value
         if gain > best.gain:

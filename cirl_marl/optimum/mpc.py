@@ -38,8 +38,8 @@ from cirl_marl.optimum.aims import Aim, Aims, aims_of
 from cirl_marl.optimum.draws import Prices
 from cirl_marl.optimum.futures import DrawnFutures
 from cirl_marl.optimum.improve import start_count, starting_actions
-from cirl_marl.optimum.linearised import MOST_SLOPES, slopes_of
 from cirl_marl.optimum.options import check_margin, check_options, demanded_levels, starting_stocks, with_margin
+from cirl_marl.optimum.slopes import MOST_SLOPES, slopes_of
 from cirl_marl.optimum.solver import Infeasible, SolverFailure
 from cirl_marl.optimum.window_climb import climb_window
 from cirl_marl.optimum.window_planner import FIRST_PRICE, MOST_ROUNDS, NOTABLE, RISE, Future, WindowPlanner

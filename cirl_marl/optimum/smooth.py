@@ -24,9 +24,10 @@ from cirl_marl.environments.actuators import Actuators
 from cirl_marl.errors import CirlError, instance_of
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum.bounds import Bound
-from cirl_marl.optimum.linearised import MOST_SLOPES, Slopes, jacobians, slopes_of, step_program
+from cirl_marl.optimum.linearised import step_program
 from cirl_marl.optimum.planned_episodes import simulate_plan
 from cirl_marl.optimum.program import LinearProgram
+from cirl_marl.optimum.slopes import MOST_SLOPES, Slopes, jacobians, slopes_of
 from cirl_marl.optimum.solver import best_values
 
 TOLERANCE = 1e-4
@@ -184,9 +185,9 @@ def _nearer(
     plain = replace(centre.bound, service_weight=None)
     price = np.zeros(len(levels) + len(limits))
     program = step_program(plain, dynamics, run, levels, price, trust, centre.slopes, margin, limits, is_held=True)
-    problem, actions = program.problem, centre.bound.actions
+    problem, columns, actions = program.problem, program.columns, centre.bound.actions
     count, controls, entries = len(program.origin), actions.size, actions.shape[1]
-    pick = sparse.csr_array((distance.half.ravel(), (np.arange(controls), program.action.ravel())), (controls, count))
+    pick = sparse.csr_array((distance.half.ravel(), (np.arange(controls), columns.action.ravel())), (controls, count))
     # ±(u − n) ≤ m, ±(u_t − u_{t−1}) ≤ c, Σ c ≤ most, and λ̄ falls by no more than the slack
     change = sparse.eye_array(controls - entries, controls, k=entries) - sparse.eye_array(controls - entries, controls)
     away, rise = -sparse.eye_array(controls), -sparse.eye_array(controls - entries)
@@ -205,7 +206,7 @@ def _nearer(
     values = distance.values(actions).ravel()
     offset, before, last = values - distance.neutral.ravel(), change @ values, [problem.cost @ program.origin + slack]
     added, high = len(values) + len(before), problem.high.copy()
-    high[program.lack] = 0.0
+    high[columns.lack] = 0.0
     second = LinearProgram(
         cost=np.concatenate([np.zeros(count), np.full(controls, 1.0 / len(actions)), np.ones(len(before))]),
         equal=sparse.hstack([problem.equal, sparse.csr_array((len(problem.equal_to), added))], format="csr"),
@@ -218,4 +219,4 @@ def _nearer(
     solution = best_values(second, np.append(program.scale, np.ones(added)))
     if solution is None:
         return None
-    return np.clip(actions + solution[program.action], -1.0, 1.0), solution[program.level]
+    return np.clip(actions + solution[columns.action], -1.0, 1.0), solution[columns.level]

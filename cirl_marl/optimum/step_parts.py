@@ -41,12 +41,10 @@ class Efforts:
         away = planned_deviation(network, plan.agents, actions, first)[controls].T
         return cls(entries, controls, away, (high - low).T / 2)
 
-    def rows(self, sign: float, action: Integers, effort: Integers, count: int) -> sparse.csr_array:
-        """Return ±half·δa − δe, of columns δa and δe of ``count``, which is at most ``limits``."""
-        places, ends = np.arange(effort.size), np.ones(effort.size)
-        values = np.concatenate([sign * self.half.ravel(), -ends])
-        columns = np.concatenate([action.ravel(), effort.ravel()])
-        return sparse.csr_array((values, (np.tile(places, 2), columns)), (effort.size, count))
+    def rows(self, sign: float) -> sparse.csr_array:
+        """Return ±half·δa − δe, of all δa and δe, interval by interval, which is at most ``limits``."""
+        half = sparse.diags_array(sign * self.half.ravel())
+        return sparse.hstack([half, -sparse.eye_array(half.shape[0])], format="csr")
 
     def limits(self, sign: float) -> Floats:
         """Return |d| ∓ d."""

@@ -15,7 +15,8 @@ from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.aims import Aims
 from cirl_marl.optimum.improve import Trials, climb
-from cirl_marl.optimum.linearised import MOST_SLOPES, slopes_of
+from cirl_marl.optimum.linearised import Span
+from cirl_marl.optimum.slopes import MOST_SLOPES, slopes_of
 from cirl_marl.optimum.window_planner import Future
 from cirl_marl.optimum.windows import WindowTask
 
@@ -85,8 +86,8 @@ def climb_window(
     later = future.later(task)
     if later is not None:
         later = replace(later, cost=later.cost / share, level_cost=later.level_cost / share)
-    first, rates = future.places(task.intervals).start, future.account_rates(task)
-    trials = Trials(simulate, value, demand, first, later, rates, free)
+    span = Span(future.places(task.intervals).start, later, future.account_rates(task), free)
+    trials = Trials(simulate, value, demand, span)
     budgets = len(task.limits)
     services = np.zeros(len(demand)) if task.demand is None else task.price[budgets:]
     price = np.concatenate([services, task.price[:budgets] / (share * future.aims.sizes[:budgets])])
