@@ -525,7 +525,7 @@ def test_corrections_of_steps_leave_contents_out() -> None:
     values = np.zeros(len(program.scale))
     values[program.columns.action] = 0.1
     trial = simulate_plan(replace(solution, actions=np.clip(solution.actions - 0.4, -1.0, 1.0)))
-    corrected, rows = program.with_correction(values, run, trial), program.measured[:, 1]
+    corrected, rows = program.with_correction(values, run, trial), program.place[:, 1]
     change = corrected.problem.under_to[: len(rows)] - program.problem.under_to[: len(rows)]
     assert (change[rows == 1] == 0).all() and (change[rows == 0] != 0).all()
     assert (rows == 1).any() and (rows == 0).any()

@@ -118,14 +118,14 @@ def test_the_program_of_a_step_is_the_episode_to_first_order(lives: bool) -> Non
         values[action] = step
         trial = simulate_plan(replace(found, actions=found.actions + step))
         moved = -(program.problem.under @ np.where(np.isin(np.arange(len(values)), action), values, 0.0))
-        return trial, values, moved[: len(program.measured)]
+        return trial, values, moved[: len(program.place)]
 
     rng = np.random.default_rng(1)
     for size, accuracy in ((1e-4, 1e-3), (0.3, None)):
         program = step_program(found, dynamics, run, demand, np.ones(2), 5.0, slopes)
         step = size * rng.uniform(-1, 1, found.actions.shape)
         trial, values, promised = after(program, step)
-        place, row = program.measured.T
+        place, row = program.place.T
         read = [np.concatenate([each.stock, each.flow], axis=1) @ program.measures.table.T for each in (run, trial)]
         change = (read[1] - read[0])[place, row]
         assert set(row.tolist()) == {0, 1, 2} and len(place) > 10

@@ -110,7 +110,7 @@ class StepProgram:
     columns: Annotated[StepColumns, "where its variables are"]
     scale: Annotated[Floats, "measure of each variable, shape (variables,)"]
     origin: Annotated[Floats, "its variables if nothing changes, likewise"]
-    measured: Annotated[Integers, "interval and measure of each of the first rows of G, shape (rows, 2)"]
+    place: Annotated[Integers, "interval and measure of each of the first rows of G, shape (rows, 2)"]
     measures: Annotated[Measures, "what these read"]
     aims: Annotated[Aims, "whose budgets the last rows of G keep"]
 
@@ -126,7 +126,7 @@ class StepProgram:
             run: the episode that the program is around.
             trial: that of the solution.
         """
-        (step, row), table = self.measured.T, self.measures.table.T
+        (step, row), table = self.place.T, self.measures.table.T
         before, after = (np.concatenate([each.stock, each.flow], axis=1) @ table for each in (run, trial))
         moves = np.zeros(len(values))
         for columns in (self.columns.moves, self.columns.part):
@@ -174,7 +174,7 @@ def step_program(
         span: its intervals.
         is_leap: whether what products of contents would be at the levels demanded counts, not at those of the episode:
             what is too impure then gets better as less is made, as it will once nothing is.
-        is_held: whether idle supplies that bring something go on to bring just what is needed, and others nothing.
+        is_held: whether idle supplies that bring something go on to bring just what is needed, and part_rows nothing.
     """
     network, aims, limits = plan.network, plan.aims, plan.aims.limits if limits is None else limits
     (steps, entries), services = plan.actions.shape, len(network.services)
@@ -188,7 +188,7 @@ def step_program(
     sizes = entries, len(supplies.services), services, 1, len(efforts.entries), pieces
     columns = StepColumns.of(steps, sizes, services + len(limits))
     moves, part, count = columns.moves, columns.part, steps * sum(sizes) + len(columns.lack)
-    charged = columns.action[:, efforts.entries]
+    effort_actions = columns.action[:, efforts.entries]
 
     low, high = np.zeros(count), np.full(count, np.inf)
     low[columns.action] = np.maximum(-trust, -1 - plan.actions)
@@ -197,44 +197,44 @@ def step_program(
         low[columns.action[span.free :]] = high[columns.action[span.free :]] = 0.0
     low[columns.supply], high[columns.supply] = supplies.low, supplies.high
     furthest = np.maximum(-low, high)
-    low[columns.effort], high[columns.effort] = -np.abs(efforts.away), efforts.half * furthest[charged]
+    low[columns.effort], high[columns.effort] = -np.abs(efforts.away), efforts.half * furthest[effort_actions]
     high[columns.level] = 1.0
 
     weights = -aims.objective(-_circularity_cost(plan, dynamics), account_shares(rates, dynamics))
     budget_weights = account_shares(budget_rates, dynamics)
-    cost, cost_later, spent = np.zeros(count), np.zeros(count), np.zeros((len(limits), count))
+    cost, cost_later, budget_rows = np.zeros(count), np.zeros(count), np.zeros((len(limits), count))
     parts = np.append(efforts.controls, np.arange(controls, controls + pieces))
     cost[part] = -aims.objective(np.zeros(part.shape), rates[2][:, :, parts])
-    spent[:, part] = budget_rates[2][:, :, parts]
+    budget_rows[:, part] = budget_rates[2][:, :, parts]
     measures = Measures.of(network, dynamics, slice(span.first, span.first + steps), margin)
-    measured, others, places = _Rows(count), _Rows(count), list[Integers]()
+    measure_rows, part_rows, places = _Rows(count), _Rows(count), list[Integers]()
     before = np.empty((slopes.end.shape[1], 0))
     for t, response in enumerate(slopes.responses()):
         past, end = moves[: t + 1].ravel(), slopes.end[t]
         cost[past] += weights[t] @ response
-        spent[:, past] += budget_weights[:, t] @ response
+        budget_rows[:, past] += budget_weights[:, t] @ response
         if span.later is not None:
             cost_later[past] += span.later.cost[t] @ response
         levels = np.maximum(run.levels[0, :, t], demand) if is_leap else run.levels[0, :, t]
         block, room, near = measures.rows(t, levels, end, response, furthest[past])
-        measured.add(block, np.append(past, columns.own[t]), room)
+        measure_rows.add(block, np.append(past, columns.own[t]), room)
         places.append(np.stack([np.full_like(near, t), near], axis=1))
         block, room = supplies.rows_of(t, measures.by_stage[:services] @ response)
-        others.add(block, past, room)
+        part_rows.add(block, past, room)
         if pieces:
-            furthest_parts = furthest[past], efforts.half[t] * furthest[charged[t]]
+            furthest_parts = furthest[past], efforts.half[t] * furthest[effort_actions[t]]
             block, room, ends = excesses.rows(t, response, before, *furthest_parts)
             low[columns.excess[t]], high[columns.excess[t]] = ends.T
-            others.add(block, np.append(past, part[t]), room)
+            part_rows.add(block, np.append(past, part[t]), room)
             before = response
     for sign in (1.0, -1.0):
-        others.add(efforts.rows(sign), np.append(charged, columns.effort), efforts.limits(sign))
+        part_rows.add(efforts.rows(sign), np.append(effort_actions, columns.effort), efforts.limits(sign))
     # mean level + lack ≥ demanded level; what is booked − excess ≤ budget
     means = sparse.kron(np.full((1, steps), 1.0 / steps), sparse.eye_array(services))
     lacks = -sparse.hstack([means, sparse.eye_array(services)], format="csr")
-    others.add(lacks, np.append(columns.level, columns.lack[:services]), -demand)
-    spent[:, columns.lack[services:]] = -np.eye(len(limits))
-    others.add(sparse.csr_array(spent), np.arange(count), limits - aims.totals(run))
+    part_rows.add(lacks, np.append(columns.level, columns.lack[:services]), -demand)
+    budget_rows[:, columns.lack[services:]] = -np.eye(len(limits))
+    part_rows.add(sparse.csr_array(budget_rows), np.arange(count), limits - aims.totals(run))
 
     size = network.objective.circularity_scale
     if plan.service_weight is not None:
@@ -264,8 +264,8 @@ def step_program(
         cost=cost,
         equal=sparse.csr_array((0, count)),
         equal_to=np.empty(0),
-        under=sparse.vstack(measured.blocks + others.blocks, format="csr"),
-        under_to=np.concatenate(measured.limits + others.limits),
+        under=sparse.vstack(measure_rows.blocks + part_rows.blocks, format="csr"),
+        under_to=np.concatenate(measure_rows.limits + part_rows.limits),
         low=low,
         high=high,
     )
