@@ -373,3 +373,11 @@ def test_fronts_reach_the_highest_service_that_there_is() -> None:
     most = bound(network, aim="driving").objective
     assert np.max(sweep.demands) == pytest.approx(most, abs=1e-5)
     assert bound(sweep._programs, aim="driving").objective < most - 0.01
+
+
+def test_a_service_that_is_made_up_for_is_not_weighed() -> None:
+    """Its level is what idle supplies make of it, whatever is demanded; programs that demand nothing tell none."""
+    network = corner()
+    assert bound(network, min_service=0.0).levels[0] < 0.5
+    with pytest.raises(CirlError, match="the best circularity takes no more than the best there is of driving 0.99999"):
+        account_front(network, ("circularity", "driving"), points=3)

@@ -162,7 +162,8 @@ def test_budgets_out_of_reach_are_approached_and_said() -> None:
     network, control = power(6), MPC(min_service=0.5, at_most={"cost": 0.0})
     run = rollout(MultiAgentVectorEnv(network, num_envs=1), control)
     assert run.accounts[0, 0] == pytest.approx(0.0, abs=1e-6)
-    assert "this one has 0.5000 less of 'demand'" in control.note
+    assert "this one has 0.5000 less of 'demand'; network" in control.note
+    assert "no actions keep the budget of" in control.note and "its price would be infinite" in control.note
     tight = MPC(min_service=1.0, at_most={"cost": 1.02 * bound(power(8), aim="cost", min_service=1.0).accounts[0]})
     run = rollout(MultiAgentVectorEnv(power(8), num_envs=1), tight)
     assert not tight.note and run.episode_levels.min() > 1 - 1e-6
@@ -185,6 +186,8 @@ def test_a_plan_is_not_left_for_a_worse_one() -> None:
     control = MPC(min_service=0.95, at_most={"emissions": 0.93 * float(free.accounts[0, 0])})
     run = rollout(MultiAgentVectorEnv("steel_japan", num_envs=1, horizon=8), control)
     assert run.accounts[0, 0] <= free.accounts[0, 0] * (1 + 1e-6)
+    least = bound("steel_japan", horizon=8, aim="emissions", min_service=0.95)
+    assert f"(at least {least.accounts[0]:.6g}): its price would be infinite" in control.note
 
 
 def test_plans_are_compared_by_what_they_exceed() -> None:

@@ -234,8 +234,8 @@ class _Sweep:
             ends = float(self._carried_out(best).accounts[0, place]), float(free.accounts[place])
         else:
             place = self._services.index(last)
-            most = bound(self.definition, aim=last, at_most=budgets, min_service=levels).levels[place]
-            ends = float(free.levels[place]), _within_reach(most)
+            most = _within_reach(bound(self.definition, aim=last, at_most=budgets, min_service=levels).levels[place])
+            ends = min(self._level(free, place), most), most
         is_range = ends[1] - ends[0] > TIGHTEST * abs(ends[1])
         for demand in np.linspace(*ends, self.points).tolist() if is_range else [max(ends)]:
             more = levels.copy()
@@ -253,6 +253,12 @@ class _Sweep:
         first, most = self._place(self.axes[0]), levels.copy()
         most[first] = _within_reach(free.levels[first])
         return bound(self.definition, aim=last, at_most=budgets, min_service=most)
+
+    def _level(self, free: Bound, place: int) -> float:
+        """Return the level that a service has anyway, of which a program that does not ask for it says too little."""
+        if self.axes[0] in self._services:
+            return float(free.levels[place])
+        return float(simulate_plan(replace(free, network=self.definition)).episode_levels[0, place])
 
     def _best(self, budgets: Mapping[str, float], levels: Floats) -> tuple[Bound, bool]:
         """Return the bound on the first aim at some demands, and whether it is that of limited supplies.

@@ -414,6 +414,16 @@ def _solve_bound(
     )
 
 
+def out_of_reach(programs: Programs, start: Floats, min_service: Floats | None, aims: Aims) -> str:
+    """Return which budgets or services no actions keep, with the best there is of each; nothing if some may."""
+    problem = programs.program(start, min_service, aims=aims)
+    try:
+        solve(problem, label="the program of what is demanded")
+    except Infeasible:
+        return _unreachable(problem, min_service, aims)
+    return ""
+
+
 def _unreachable(problem: Program, min_service: Floats | None, aims: Aims) -> str:
     """Say what is wrong with a program without solution: budgets or services out of reach, with the best of each."""
     network, last = problem.layout.network, len(problem.under_to)

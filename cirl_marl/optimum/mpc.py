@@ -35,10 +35,12 @@ from cirl_marl.network.innovations import innovations
 from cirl_marl.network.uncertainty import expected_network
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.aims import Aim, Aims, aims_of
+from cirl_marl.optimum.bounds import out_of_reach
 from cirl_marl.optimum.draws import Prices
 from cirl_marl.optimum.futures import DrawnFutures
 from cirl_marl.optimum.improve import start_count, starting_actions
 from cirl_marl.optimum.options import check_margin, check_options, demanded_levels, starting_stocks, with_margin
+from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.slopes import MOST_SLOPES, slopes_of
 from cirl_marl.optimum.solver import Infeasible, SolverFailure
 from cirl_marl.optimum.window_climb import climb_window
@@ -279,8 +281,8 @@ class MPC(Planner):
             progress((copy + 1) / env.num_envs)
 
     def _note_faults(self, plan: WindowPlan | None) -> None:
-        """Say what a first plan of all intervals exceeds of a budget, and what it lacks of a service."""
-        if plan is None:
+        """Say what a first plan of all intervals exceeds of a budget, what it lacks of a service, and if it has to."""
+        if plan is None or self.note:
             return
         network = self._env.network
         excess = plan.bookings.sum(axis=0) - plan.task.limits
@@ -292,6 +294,10 @@ class MPC(Planner):
         if faults:
             demands = "services and budgets" if self._aims.budgets else "services"
             self.note = f"no plan was found that keeps {demands}; this one has {', '.join(faults)}"
+        if faults and self._aims.budgets and not network.disturbed:
+            programs = Programs(Admissible.of(network, self._env.agents), self._degree, None)
+            reason = out_of_reach(programs, plan.task.stock, self._levels, self._aims)
+            self.note += f"; {reason}" if reason else ""
 
     def act(self, observations: Arrays) -> Arrays:
         """Return the next actions, from the current state of the environment that was started.
