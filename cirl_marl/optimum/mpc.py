@@ -294,7 +294,7 @@ class MPC(Planner):
         if faults:
             demands = "services and budgets" if self._aims.budgets else "services"
             self.note = f"no plan was found that keeps {demands}; this one has {', '.join(faults)}"
-        if faults and self._aims.budgets and not network.disturbed:
+        if faults and self._aims.budgets and not (network.disturbed or self._env.uncertain):
             programs = Programs(Admissible.of(network, self._env.agents), self._degree, None)
             reason = out_of_reach(programs, plan.task.stock, self._levels, self._aims)
             self.note += f"; {reason}" if reason else ""
