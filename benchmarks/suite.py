@@ -27,7 +27,7 @@ from cirl_marl.records.files import write_atomically
 from cirl_marl.report.benchmark_tables import TABLES, save_profiles
 from cirl_marl.suite.held_out import VARIANTS
 from cirl_marl.suite.result_rows import read_rows
-from cirl_marl.suite.task_bounds import TaskBound, values_at
+from cirl_marl.suite.task_bounds import TaskBound, row_names, values_at
 from cirl_marl.suite.tasks import (
     CONTROLLERS,
     DECLARATION,
@@ -69,6 +69,7 @@ def prove(network: Network, episodes: int, seed: int, min_service: float) -> Tas
         half_width=0.0,
         equal=solution.certificate.equal,
         under=solution.certificate.under,
+        rows=row_names(solution.problem)[solution.certificate.under != 0],
     )
 
 
@@ -82,6 +83,7 @@ def of_draws(proof: UncertainBound) -> TaskBound:
         half_width=proof.half_width,
         equal=np.zeros(0),
         under=np.zeros(0),
+        rows=np.zeros(0),
     )
 
 

@@ -101,7 +101,6 @@ class Programs:
         large: int | None = None,
         constant_shares: bool = True,
         steady_parts: bool = False,
-        shortages: bool = True,
         system: ComparisonSystem | None = None,
         intervals: range | None = None,
         layout: Layout | None = None,
@@ -121,13 +120,12 @@ class Programs:
             constant_shares: whether shares of what passes nodes without stock are constant within an interval, unless
                 the degree is 0, the program large or its layout given.
             steady_parts: whether what is constant of flows that may vary has variables for these: tighter, and slower.
-            shortages: whether it has rows of how far stocks fall short while idle arcs supply them.
             system: of a program of the same network and agents, whatever their services demand.
             intervals: that programs will be of; None: of all.
             layout: of another program of the network, whatever its numbers; None: what its own ask for.
             cache: of programs of other numbers in the same network, with the same agents.
         """
-        self.admissible, lifetimes, self._shortages = admissible, admissible.lifetimes, shortages
+        self.admissible, lifetimes = admissible, admissible.lifetimes
         has_lifetimes = lifetimes.plan_network is not lifetimes.reach_network
         if system is None:
             chain_form = admissible
@@ -235,8 +233,7 @@ class Programs:
         rows = ProgramRows(layout, steps)
         valve_envelopes(admissible, reach, intervals, rows)
         idle_supplies(admissible, reach, intervals, rows)
-        if self._shortages:
-            shortage_rows(admissible, self.system, reach, initial, intervals, rows)
+        shortage_rows(admissible, self.system, reach, initial, intervals, rows)
         least_deliveries(admissible, reach, intervals, rows)
         order_rows(admissible, reach, intervals, rows)
         low, high = _box(admissible, reach, lifetime_flow, layout, period)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,13 +12,16 @@ from numpy.typing import ArrayLike
 from cirl_marl.controllers.rollout import first_seed, starting_stocks
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import RunError
-from cirl_marl.network import Floats, Network
+from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import frozen_record
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.certificate import Certificate, verify
 from cirl_marl.optimum.options import DEGREE
-from cirl_marl.optimum.program import Programs
+from cirl_marl.optimum.program import Program, Programs
 from cirl_marl.records.files import write_atomically
+
+SAME_ROW = 1e-9
+"""Relative difference of two names up to which they are of the same row, computed by other versions or machines."""
 
 
 @frozen_record
@@ -39,6 +42,7 @@ class TaskBound:
     half_width: Annotated[float, "of the one-sided 95 % interval of the mean of values, mass; 0 if nothing is drawn"]
     equal: Annotated[Floats, "multipliers of the equalities; empty if the bound is of draws, each with its own"]
     under: Annotated[Floats, "of the inequalities, likewise"]
+    rows: Annotated[Floats, "names of those whose multiplier is not 0, at the mean of the starts; see ``row_names``"]
 
     def gaps(self, circularity: ArrayLike, levels: ArrayLike) -> Floats:
         """Return (value − λ̄ − Σ_s μ_s (level_s − demand_s))/scale of each episode, of all or the first.
@@ -51,27 +55,28 @@ class TaskBound:
         return np.asarray((self.values[: len(merit)] - merit) / self.scale)
 
     def write(self, path: Path) -> None:
-        """Write the file."""
+        """Write the file, and beside it the names of rows."""
         arrays = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
-
-        def save(place: Path) -> None:
-            with place.open("wb") as file:
-                np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
-
-        write_atomically(path, save)
+        for place, names in ((path, [*arrays][:-1]), (rows_path(path), ["rows"])):
+            _save(place, {name: arrays[name] for name in names})
 
     @classmethod
     def read(cls, path: Path) -> TaskBound:
-        """Read the file; a ``RunError`` if it is something else."""
+        """Read the file, and the names of rows beside it; a ``RunError`` if one is something else."""
+        place = path
         try:
-            with np.load(path, allow_pickle=False) as arrays:
-                parts = {field.name: arrays[field.name] for field in fields(cls)}
-                return cls(**{name: part if part.ndim else float(part) for name, part in parts.items()})  # type: ignore[arg-type]
+            parts: dict[str, Any] = {}
+            for place in (path, rows_path(path)):
+                with np.load(place, allow_pickle=False) as arrays:
+                    parts |= {name: part if part.ndim else float(part) for name, part in arrays.items()}
+            return cls(**{field.name: parts[field.name] for field in fields(cls)})
         except (OSError, ValueError, KeyError) as error:
-            raise RunError(f"{path}: is not the bound of a task: {error!r}") from error
+            raise RunError(f"{place}: is not the bound of a task: {error!r}") from error
 
     def recompute(self, network: Network, seed: int) -> Floats:
         """Return what the multipliers prove of each episode, computed anew without a solver, shape (episodes,), mass.
+
+        Rows that the program has got since have none, and those of rows that it no longer has prove nothing.
 
         Raises:
             RunError: if the bound has no multipliers of its own.
@@ -79,17 +84,53 @@ class TaskBound:
         if not len(self.equal):
             raise RunError(f"network '{network.name}': each draw of its bound has multipliers, which are not kept")
         starts = starting_stocks(MultiAgentVectorEnv(network, num_envs=len(self.values)), first_seed(seed))
-        return values_at(network, starts, Certificate(equal=self.equal, under=self.under), self.demand)
+        return values_at(network, starts, Certificate(equal=self.equal, under=self.under), self.demand, self.rows)
 
 
-def values_at(network: Network, starts: Floats, certificate: Certificate, demand: Floats) -> Floats:
+def values_at(
+    network: Network, starts: Floats, certificate: Certificate, demand: Floats, rows: Floats | None = None
+) -> Floats:
     """Return what multipliers prove of episodes from some starts, shape (episodes,), mass.
 
-    Those that have none for rows of shortages are of programs without them, as tasks of version 1 have them.
+    With the names of their ``rows`` they may be of a program that has other rows beside these.
     """
-    admissible, levels = Admissible.of(network, None), demand if len(demand) else None
-    programs = Programs(admissible, DEGREE, None)
-    if len(programs.program(starts[0], levels).under_to) != len(certificate.under):
-        programs = Programs(admissible, DEGREE, None, shortages=False, system=programs.system)
+    programs, levels = Programs(Admissible.of(network, None), DEGREE, None), demand if len(demand) else None
+    if rows is not None:
+        own = row_names(programs.program(starts.mean(axis=0), levels))
+        certificate = replace(certificate, under=_of_rows(own, rows, certificate.under[certificate.under != 0]))
     problems = (programs.program(start, levels) for start in starts)
     return np.array([verify(problem, certificate, np.zeros(len(problem.cost))).bound for problem in problems])
+
+
+def rows_path(path: Path) -> Path:
+    """Return where the names of the rows of a bound are kept: versions that had none hash its file alone."""
+    return path.with_name(f"{path.stem}.rows.npz")
+
+
+def row_names(problem: Program) -> Floats:
+    """Return a name of each inequality: what it is of fixed random numbers in place of the variables.
+
+    It is the same wherever the row stands, and whichever others there are.
+    """
+    # of PCG64 NumPy promises the same numbers in all versions
+    return np.asarray(problem.under @ (1.0 + np.random.PCG64(0).random_raw(len(problem.cost)) / 2.0**64))
+
+
+def _of_rows(own: Floats, names: Floats, multipliers: Floats) -> Floats:
+    """Return multipliers of rows with names of their ``own``, given those of some ``names``; 0 where there is none."""
+    order: Integers = np.argsort(own)
+    place = np.searchsorted(own[order], names)
+    nearest = np.stack([order[np.clip(place - side, 0, len(own) - 1)] for side in (0, 1)])
+    row = np.take_along_axis(nearest, np.abs(own[nearest] - names).argmin(axis=0)[None], axis=0)[0]
+    is_same = np.abs(own[row] - names) <= SAME_ROW * np.abs(names)
+    under = np.zeros(len(own))
+    np.add.at(under, row[is_same], multipliers[is_same])
+    return under
+
+
+def _save(path: Path, arrays: dict[str, Floats]) -> None:
+    def save(place: Path) -> None:
+        with place.open("wb") as file:
+            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+
+    write_atomically(path, save)
