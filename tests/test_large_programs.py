@@ -11,6 +11,7 @@ import pytest
 from scipy import sparse
 from small_networks import cycle
 
+from benchmarks.yearly import LIFETIMES, yearly_network
 from cirl_marl import (
     Arc,
     Control,
@@ -25,10 +26,23 @@ from cirl_marl import (
     load_network,
 )
 from cirl_marl.controllers.rollout import rollout
-from cirl_marl.optimum import bound, improve, improve_plan, program, reach, simulate_plan, solver, window_planner
+from cirl_marl.optimum import (
+    bound,
+    improve,
+    improve_plan,
+    program,
+    reach,
+    simulate_plan,
+    solver,
+    transit,
+    window_planner,
+)
 from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.certificate import verify
 from cirl_marl.optimum.improve import penalised_objective, prices
 from cirl_marl.optimum.mpc import MPC
+from cirl_marl.optimum.options import starting_stocks
+from cirl_marl.optimum.program import Programs
 
 
 def turning_over(rate: float) -> Network:
@@ -47,13 +61,12 @@ def turning_over(rate: float) -> Network:
 
 
 @pytest.mark.parametrize(
-    ("network", "merged"),
-    [(load_network("steel_japan"), False), (turning_over(0.45), False), (turning_over(0.55), True)],
+    ("network", "merged"), [(load_network("steel_japan"), False), (turning_over(1.9), False), (turning_over(2.1), True)]
 )
 def test_pieces_are_merged_where_stocks_are_fast(
     network: Network, merged: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A large program has one piece a year; rows about its end only if half a stock turns over in it."""
+    """A large program has one piece a year; rows about its end only if stocks turn over twice in it."""
     admissible = Admissible.of(network)
     fine = program._layout(admissible, 2, False, 1)
     monkeypatch.setattr(program, "LARGE", 0)
@@ -288,6 +301,45 @@ def test_simplex_is_tried_where_interior_points_do_not_do(
     monkeypatch.setattr(solver._ScaledProgram, "distance", lambda *_: distance)
     solver.solve(problem)
     assert tried == [*solver.SETTINGS][:count]
+
+
+@pytest.mark.medium
+def test_interior_points_alone_leave_good_multipliers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a generated cycle in merged pieces, where rows that presolve merges as parallel spoil them."""
+    monkeypatch.setattr(program, "LARGE", 7000)
+    admissible = Admissible.of(yearly_network(76, LIFETIMES).with_options(episode={"horizon": 6}))
+    problem = Programs(admissible, 2, None).program(starting_stocks(admissible.lifetimes, None), 0.9)
+    distances, distance = list[float](), solver._ScaledProgram.distance
+
+    def noted(*answer: Any) -> float:
+        distances.append(distance(*answer))
+        return distances[-1]
+
+    monkeypatch.setattr(solver._ScaledProgram, "distance", noted)
+    monkeypatch.setattr(solver, "BASIS_PROGRAM", 0)
+    assert solver.solve(problem).basis is None
+    assert len(distances) == 1 and distances[0] <= solver.OPTIMAL
+    first = dict(solver.INTERIOR_SETTINGS[0])
+    monkeypatch.setattr(solver, "INTERIOR_SETTINGS", ({**first, "presolve_rule_off": 0}, *solver.SETTINGS))
+    solver.solve(problem)
+    assert len(distances) > 2
+
+
+@pytest.mark.medium
+def test_few_choices_of_fast_stocks_tell_nearly_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of constant shares past fast stocks in merged pieces: another choice is not missed, each of these would be."""
+    admissible = Admissible.of(yearly_network(110, LIFETIMES).with_options(episode={"horizon": 5}))
+    start, choices = starting_stocks(admissible.lifetimes, None), transit.FAST
+    proved = []
+    for fast in (choices, (*choices, 0.5, 4.0), (np.inf,)):
+        monkeypatch.setattr(transit, "FAST", fast)
+        programs = Programs(admissible, 2, None, large=1000)
+        assert programs.layout.pieces == 1 and programs.layout.has_end_flows
+        problem = programs.program(start, 0.9)
+        proved.append(verify(problem, (found := solver.solve(problem)).certificate, found.plan).bound)
+    chosen, more, fewer = proved
+    assert chosen == pytest.approx(more, rel=1e-4)
+    assert fewer - chosen > 3e-4 * abs(chosen)
 
 
 def test_without_hipo_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

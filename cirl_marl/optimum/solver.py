@@ -31,9 +31,13 @@ HighsOptions = Mapping[str, str | float]
 CLEANUP_ITERATIONS = 2000
 """Simplex iterations after interior points. Where these stop short, HiGHS goes on by simplex, without end in programs
 of 25 000 variables; after a crossover it takes a few."""
+PARALLEL_RULE = 1 << 13
+"""HiGHS's number of the rule of presolve that merges parallel rows and columns. Undone without a basis it leaves
+multipliers that may be wrong by orders of magnitude; without the rule none of 58 programs of generated cycles had such.
+"""
 SETTINGS: tuple[HighsOptions, ...] = (
     {"solver": "ipx", "simplex_iteration_limit": CLEANUP_ITERATIONS},
-    {"solver": "ipx", "run_crossover": "off"},
+    {"solver": "ipx", "run_crossover": "off", "presolve_rule_off": PARALLEL_RULE},
     {"solver": "ipx", "run_crossover": "off", "presolve": "off"},
     {"solver": "simplex", "presolve": "off"},
 )
@@ -43,14 +47,16 @@ Crossover, which finds a basis for later programs, and presolve fail now and the
 of a control interval, rows fix a stock several times over, and multipliers of merged rows go wrong. Interior points
 without them do not, and leave no basis.
 """
+INTERIOR_SETTINGS: tuple[HighsOptions, ...] = ({**SETTINGS[1], "kkt_tolerance": 1e-6}, *SETTINGS)
+"""What is tried for a program of which multipliers have to prove something, from BASIS_PROGRAM variables on."""
 EXTRA = "highspy_extras"
 """Package that brings HiPO."""
 LARGE_PROGRAM = 100_000
 """Variables from which on a program is large: crossover may then take hours."""
 BASIS_PROGRAM = 25_000
-"""Variables from which on a program that proves nothing is solved by interior points alone. In windows of steel_world,
-35 231, they take 11 s, crossover up to 37 s more; 7600 simplex iterations from a near basis do not end in 13 s, those
-from nothing end after 45 s without an answer."""
+"""Variables from which on a program is solved by interior points alone. In windows of steel_world, 35 231, they take
+11 s, crossover up to 37 s more; 7600 simplex iterations from a near basis do not end in 13 s, those from nothing end
+after 45 s without an answer."""
 PLANNED = (highspy.HighsModelStatus.kOptimal, highspy.HighsModelStatus.kUnknown)
 """How HiGHS ends with a plan. The latter is of multipliers that go wrong where presolve is undone without crossover."""
 LARGE_SETTINGS: tuple[HighsOptions, ...] = (
@@ -151,6 +157,8 @@ def solve(
         attempts = MIDDLING_SETTINGS if len(problem.cost) >= HIPO_PROGRAM else SETTINGS[1:2]
     elif is_large:
         attempts = (ROUGH_SETTINGS, *LARGE_SETTINGS) if is_rough else LARGE_SETTINGS
+    elif len(problem.cost) >= BASIS_PROGRAM:
+        attempts = INTERIOR_SETTINGS
     if not find_spec(EXTRA):  # HiGHS would take another solver for HiPO
         attempts = [settings for settings in attempts if settings["solver"] != "hipo"]
     # the multipliers of a rough answer are all that is asked for

@@ -29,10 +29,12 @@ from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import Admissible, IntervalRanges
 from cirl_marl.optimum.kernels import bernstein_means
 from cirl_marl.optimum.matrices import Layout, ProgramRows
-from cirl_marl.optimum.quasi_steady import FAST, ROUND_OFF, WIDER, cut_responses
+from cirl_marl.optimum.quasi_steady import ROUND_OFF, WIDER, cut_responses
 from cirl_marl.optimum.reach import Linear
 
 Mask = NDArray[np.bool_]
+FAST = (np.inf, 2.0, 8.0)
+"""Turnovers in an interval from which on a stock counts as fast; there are rows for each choice."""
 
 
 @positional_record
@@ -255,7 +257,7 @@ class ConstantShares:
         # what leaves a lifetime may be nothing
         least = np.where(np.isin(np.arange(self.stores), self.transit.lives), most, least)
         choices: set[bytes] = set()
-        for choice, turnover in enumerate((np.inf, *FAST)):
+        for choice, turnover in enumerate(FAST):
             sources = self.transit.sources(least * self.interval >= turnover)[place]
             key = np.concatenate([sources.fast, [-1], *sources.varying]).tobytes()
             if sources.is_regular and key not in choices:
