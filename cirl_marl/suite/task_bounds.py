@@ -96,8 +96,8 @@ def values_at(
     """
     programs, levels = Programs(Admissible.of(network, None), DEGREE, None), demand if len(demand) else None
     if rows is not None:
-        own = row_names(programs.program(starts.mean(axis=0), levels))
-        certificate = replace(certificate, under=_of_rows(own, rows, certificate.under[certificate.under != 0]))
+        present = row_names(programs.program(starts.mean(axis=0), levels))
+        certificate = replace(certificate, under=_of_rows(present, rows, certificate.under[certificate.under != 0]))
     problems = (programs.program(start, levels) for start in starts)
     return np.array([verify(problem, certificate, np.zeros(len(problem.cost))).bound for problem in problems])
 
@@ -116,14 +116,14 @@ def row_names(problem: Program) -> Floats:
     return np.asarray(problem.under @ (1.0 + np.random.PCG64(0).random_raw(len(problem.cost)) / 2.0**64))
 
 
-def _of_rows(own: Floats, names: Floats, multipliers: Floats) -> Floats:
-    """Return multipliers of rows with names of their ``own``, given those of some ``names``; 0 where there is none."""
-    order: Integers = np.argsort(own)
-    place = np.searchsorted(own[order], names)
-    nearest = np.stack([order[np.clip(place - side, 0, len(own) - 1)] for side in (0, 1)])
-    row = np.take_along_axis(nearest, np.abs(own[nearest] - names).argmin(axis=0)[None], axis=0)[0]
-    is_same = np.abs(own[row] - names) <= SAME_ROW * np.abs(names)
-    under = np.zeros(len(own))
+def _of_rows(present: Floats, names: Floats, multipliers: Floats) -> Floats:
+    """Return multipliers of rows whose names are ``present``, given those of some ``names``; 0 where there is none."""
+    order: Integers = np.argsort(present)
+    place = np.searchsorted(present[order], names)
+    nearest = np.stack([order[np.clip(place - side, 0, len(present) - 1)] for side in (0, 1)])
+    row = np.take_along_axis(nearest, np.abs(present[nearest] - names).argmin(axis=0)[None], axis=0)[0]
+    is_same = np.abs(present[row] - names) <= SAME_ROW * np.abs(names)
+    under = np.zeros(len(present))
     np.add.at(under, row[is_same], multipliers[is_same])
     return under
 
