@@ -177,7 +177,7 @@ def test_what_no_file_holds_is_refused_before_anything_is_simulated(
     for arguments, message in (
         ([*japan, "--iamc", "iamc.xlsx"], "--iamc iamc.xlsx: needs the name of a .csv file"),
         ([*japan, "--iamc", str(tmp_path / "file" / "iamc.csv")], "file is a file, not a folder"),
-        (["paper_city", "--iamc", iamc], "IAMC has calendar years; give"),
+        (["paper_city", "--iamc", iamc], "IAMC has calendar years; give [episode] a start at the turn of a year"),
         ([str(twice), "--iamc", iamc], "Circularity would come 2 times; give other titles"),
         ([*japan, "--package", str(tmp_path / "file" / "data")], "file is a file, not a folder"),
     ):

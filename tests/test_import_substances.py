@@ -238,6 +238,23 @@ def test_stores_mix_what_the_table_says(tmp_path: Path) -> None:
     assert report.content_error == pytest.approx(0.01, rel=1e-6)
 
 
+def test_a_store_that_mixes_is_told_from_one_that_runs_empty(tmp_path: Path) -> None:
+    """Who separates what a store gives sends other masses on if that has another content than in the table."""
+    flows = (("Mine", "Use", 100, 10), ("Use", "Sorter", 30, 3), ("Use", "Dump", 30, ""))
+    sorted_ = (("Sorter", "Product", 20, 0.5), ("Sorter", "Dump", 10, 2.5))
+    rows = [
+        [*ends, 2000, name, amount, "kt/year", ""]
+        for *ends, whole, copper in (*flows, *sorted_)
+        for name, amount in (("", whole), ("Copper", copper))
+        if amount != ""
+    ]
+    message = r"give back 'Sorter' to '.*; of 'Use' to 'Sorter' 0\.05 is Copper, not 0\.1: a store mixes what it holds"
+    with pytest.raises(CirlError, match=message):
+        imported(tmp_path, rows, stores=["Use"])
+    rows.append(["Use", "Dump", 2000, "Copper", 3, "kt/year", ""])
+    assert imported(tmp_path, rows, stores=["Use"]).content_error < 1e-9
+
+
 def test_regions_have_contents_of_their_own(tmp_path: Path) -> None:
     """Each is a network with its contents, of sources and of stores."""
     header = [*HEADER, "region"]

@@ -18,7 +18,7 @@ from cirl_marl.importing.balances import Change, Processes, ProcessKind, Reconci
 from cirl_marl.importing.definition import DefinitionWriter, ImportedFiles, identifiers
 from cirl_marl.importing.flow_table import FlowTable, StockKey, read_flows, read_stocks
 from cirl_marl.importing.grids import plain_text
-from cirl_marl.network import Network
+from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Role
 from cirl_marl.records.files import publish_folder, write_table
@@ -298,9 +298,11 @@ def _largest_errors(
             pair = [*definition.arcs][int(k)]
             value = run.flow[y, order[int(k)]]
             label = f"{table.years[int(y)]}{f' in {region}' if region else ''}"
+            contents = run.contents[y][:, len(network.nodes) + np.array(order)]
+            cause = _mixed_store(table, processes, contents, (done, int(y)))
             raise CirlError(
                 f"{table.name}: the network does not give back {pair} in {label}: {value:g}, not {table_flows[y, k]:g} "
-                f"{table.unit}; a store may run empty: give stocks"
+                f"{table.unit}; {cause or 'a store may run empty: give stocks'}"
             )
         worst = max(worst, float(errors.max()))
         if table.substances is not None:
@@ -317,6 +319,28 @@ def _largest_errors(
                 raise CirlError(f"{table.name}: the network does not give back {flow}; does it balance?")
         progress((done + 1) / len(ids))
     return worst, worst_content
+
+
+def _mixed_store(table: FlowTable, processes: Processes, contents: Floats, place: tuple[int, int]) -> str:
+    """Say which store does not give what the table has, as it mixes all that it holds; empty if none is far off.
+
+    Args:
+        table: of all regions and years.
+        processes: of the table.
+        contents: parts of substances in its flows, as simulated, shape (substances, pairs).
+        place: region and year.
+    """
+    if table.substances is None:
+        return ""
+    stores, flow = processes.of(ProcessKind.STORE), table.grid(table.values)[place]
+    leaves = np.array([pair.source in stores for pair in table.pairs]) & (flow > 0)
+    parts = np.divide(table.substances.amounts[:, *place], flow, out=np.zeros_like(contents), where=flow > 0)
+    errors = np.abs(contents - parts) * leaves
+    s, k = np.unravel_index(int(errors.argmax()), errors.shape)
+    if errors[s, k] <= WRONG * parts[s].max():
+        return ""
+    fault = f"of {table.pairs[int(k)]} {contents[s, k]:.3g} is {table.substances.names[int(s)]}, not {parts[s, k]:.3g}"
+    return f"{fault}: a store mixes what it holds; say what is in all that leaves it, or in its stocks"
 
 
 def _content_errors(

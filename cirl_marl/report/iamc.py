@@ -125,7 +125,8 @@ def _years(network: Network) -> range:
     episode = network.episode
     begins = None if episode.start is None else year(episode.start)
     if begins is None or begins % 1 or not in_years(network.time_unit):
-        raise CirlError(f"network '{network.name}': IAMC has calendar years; give [episode] a start, such as 2025")
+        remedy = "give [episode] a start at the turn of a year, such as 2025, and count time in years"
+        raise CirlError(f"network '{network.name}': IAMC has calendar years; {remedy}")
     if abs(episode.control_interval / elapsed_time(begins + 1, begins, network.time_unit) - 1) > 1e-9:
         interval = f"{episode.control_interval:g} {network.time_unit}"
         raise CirlError(f"network '{network.name}': IAMC has a value a year; its control interval is {interval}")
