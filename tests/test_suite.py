@@ -24,6 +24,8 @@ from cirl_marl import CirlError, Neutral, RunError, Trained, load_task, tasks
 from cirl_marl.controllers.rollout import first_seed, rollout, starting_stocks
 from cirl_marl.definitions.ids import ids
 from cirl_marl.environments.vector import MultiAgentVectorEnv
+from cirl_marl.jobs import run_jobs
+from cirl_marl.learners import interface
 from cirl_marl.learners.acting_weights import acting_weights, rebuild_run
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.certificate import Certificate
@@ -165,7 +167,12 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of a benchmark with a learner's row, of a training of some seconds, and neutral control's."""
     folder, patch = tmp_path_factory.mktemp("suite"), pytest.MonkeyPatch()
     patch.setattr(declared.SuiteAlgorithm, "steps", lambda algorithm, task: 2 * 32 * 160)
-    patch.setattr(row_jobs, "shutil", SimpleNamespace(rmtree=lambda run: run.rename(folder / "original")))
+
+    def keep(run: Path) -> None:
+        if run.is_dir():
+            run.rename(folder / "original")
+
+    patch.setattr(row_jobs, "shutil", SimpleNamespace(rmtree=keep))
     outcome = cirl_marl.benchmark(
         [TASK], algorithms=["neutral", "ppo"], seeds=[401], out=folder, contributor="me", held_out=True
     )
@@ -186,6 +193,54 @@ def test_a_row_is_made_once(trained: Path, monkeypatch: pytest.MonkeyPatch) -> N
     again = cirl_marl.benchmark([TASK], algorithms=["neutral", "ppo"], seeds=[401], out=trained, held_out=True)
     assert list(again.rows) == rows
     assert not list((trained / "runs").iterdir())
+
+
+class Killed(BaseException):
+    """What no job survives."""
+
+
+def test_kills_lose_nothing_and_double_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wherever a benchmark is killed, the same call goes on: one training, one row, and no training is left behind."""
+    trainings, options = list[Path](), {"algorithms": ["ppo"], "seeds": [401], "out": tmp_path}
+    monkeypatch.setattr(declared.SuiteAlgorithm, "steps", lambda algorithm, task: 32 * 160)
+    real = interface.train
+
+    def counted(*arguments: Any, directory: Path, **settings: Any) -> Any:
+        trainings.append(directory)
+        return real(*arguments, directory=directory, **settings)
+
+    def killed(*arguments: Any, **settings: Any) -> None:
+        raise Killed
+
+    def killed_in_half(path: Path) -> None:
+        (path / "config.json").unlink()
+        raise Killed
+
+    monkeypatch.setattr(interface, "train", counted)
+    for place, name in ((row_jobs, "write_weights"), (declared.BenchmarkTask, "measure"), (row_jobs, "add_rows")):
+        with monkeypatch.context() as patch, pytest.raises(Killed):
+            patch.setattr(place, name, killed)
+            cirl_marl.benchmark([TASK], **options)  # type: ignore[arg-type]
+        assert not (tmp_path / "results.csv").exists()
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(row_jobs, "shutil", SimpleNamespace(rmtree=killed_in_half))
+        cirl_marl.benchmark([TASK], **options)  # type: ignore[arg-type]
+    assert trainings[0].is_dir()
+    outcome = cirl_marl.benchmark([TASK], **options)  # type: ignore[arg-type]
+    assert [row.id for row in outcome.rows] == [f"{TASK}/ppo/401"] and not outcome.failures
+    assert list(outcome.rows) == read_rows(tmp_path / "results.csv")
+    assert len(trainings) == 1 and not trainings[0].exists()
+
+
+def test_policies_act_on_variants_when_there_are_some(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Several rows may be made at a time, so that those of variants are begun when the others are there."""
+    figure = SimpleNamespace(value=0.5, low=0.4, high=0.6)
+    figures = SimpleNamespace(circularity=figure, service=figure, gap=figure)
+    monkeypatch.setattr(declared.BenchmarkTask, "measure", lambda *arguments, **options: figures)
+    monkeypatch.setattr(row_jobs, "run_jobs", lambda jobs, *rest, **options: run_jobs(jobs[::-1], *rest, **options))
+    outcome = cirl_marl.benchmark([TASK], algorithms=["mpc"], out=tmp_path, held_out=True)
+    assert not outcome.failures and [row.variant for row in outcome.rows] == [0, 1, 2, 3]
+    assert len({row.sha256 for row in outcome.rows}) == 1
 
 
 def test_weights_act_as_the_run_did(trained: Path, tmp_path: Path) -> None:

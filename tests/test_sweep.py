@@ -10,6 +10,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +31,7 @@ from cirl_marl.learners.interface import train
 from cirl_marl.network import Network
 from cirl_marl.sweeps import Cell, CellStatus, load_sweep, sweep
 from cirl_marl.sweeps.cells import cells_of
+from cirl_marl.sweeps.folder import SweepFolder
 from cirl_marl.sweeps.reading import SweepFile
 
 RECIPE = """
@@ -285,6 +287,40 @@ def test_a_cell_that_fails_is_named_and_the_others_go_on(
     assert command(monkeypatch, "sweep", "sweep.toml", "--on", "here") == 0
     shown = capsys.readouterr().out
     assert f"done: {missing}" in shown and "4 of 4 cells done; table: runs/sweep-sweep/sweep.csv" in shown
+
+
+def test_a_sweep_that_was_killed_while_it_was_begun_is_begun(asked: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was being written then, by this machine or another that is at it, is nothing else than a sweep."""
+    monkeypatch.setattr("cirl_marl.sweeps.running.run_jobs", lambda *_, **__: [])
+    Path("out").mkdir()
+    for name in (f".partial-{0:08x}-1-0.json", ".asked.lock"):
+        Path("out", name).touch()
+    assert len(sweep(asked, on="here", out="out").rows) == 4
+
+
+def test_the_table_of_two_that_share_a_folder_has_the_results_of_both(
+    asked: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who ends while another writes its table waits, and writes one in which nothing is missing."""
+    monkeypatch.setattr("cirl_marl.sweeps.running.run_jobs", lambda *_, **__: [])
+    first = sweep(asked, on="here", out="out")
+    folder, others = SweepFolder(Path("out")), list[threading.Thread]()
+    real, cell = SweepFolder.rows, folder.cell(first.rows[0]["cell"])
+
+    def rows(self: SweepFolder) -> list[dict[str, Any]]:
+        seen = real(self)
+        if not others:
+            (cell / "result.json").write_text('{"unit": "t"}')
+            others.append(threading.Thread(target=SweepFolder(Path("out")).write_table))
+            others[0].start()
+            others[0].join(timeout=0.3)
+        return seen
+
+    monkeypatch.setattr(SweepFolder, "rows", rows)
+    folder.write_table()
+    others[0].join()
+    with folder.table.open(newline="") as file:
+        assert [row["state"] for row in csv.DictReader(file)] == ["done"] + ["missing"] * 3
 
 
 def test_a_network_that_is_edited_meanwhile_is_noticed(asked: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
@@ -49,6 +50,11 @@ class ResultJob:
     out: Path
 
     @property
+    def run_directory(self) -> Path:
+        """Its training, while there is no row."""
+        return self.out / "runs" / self.name
+
+    @property
     def name(self) -> str:
         """Name of its files."""
         return self.row.id.replace("/", "-") + (f".{self.row.variant}" if self.row.variant else "")
@@ -79,6 +85,12 @@ class ResultJob:
         controller, options = controller_of(task, row.algorithm, weights)
         columns |= columns_of(task.measure(controller, episodes=row.episodes, **options))
         add_rows(self.out / TABLE, [ResultRow(**{**row.as_dict(), **columns})])
+        self.clear()
+
+    def clear(self) -> None:
+        """Remove the training, which whoever was killed while doing so left in part, and several may do at once."""
+        with suppress(FileNotFoundError):
+            shutil.rmtree(self.run_directory)
 
     def _train_or_plan(self, task: BenchmarkTask, tell: Tell) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         """Return arrays and description of what acts."""
@@ -94,19 +106,17 @@ class ResultJob:
         from cirl_marl.learners.acting_weights import acting_weights  # it needs torch
         from cirl_marl.learners.interface import complete_run
 
-        algorithm, directory = load_algorithm(row.algorithm), self.out / "runs" / self.name
+        algorithm = load_algorithm(row.algorithm)
         steps = algorithm.steps(task)
         run = complete_run(
-            directory,
+            self.run_directory,
             task.network(),
             algorithm.recipe_of(),
             steps=steps,
             seed=row.seed,
             report=lambda now: tell("training", steps - now.total + now.env_steps, steps),
         )
-        weights = acting_weights(run)
-        shutil.rmtree(directory)
-        return weights
+        return acting_weights(run)
 
 
 def _mpc_settings(task: BenchmarkTask) -> dict[str, Any]:
@@ -147,7 +157,7 @@ def benchmark(
         held_out: whether the policies act on the held-out variants of the tasks as well.
         on: ``here``, ``local``, ``slurm`` or ``ray``.
         workers: how many rows at a time; None is as many as the place has.
-        watch: called with the status of all rows, about once a second.
+        watch: called with the status of all rows, about once a second; those of held-out variants come last.
 
     Raises:
         CirlError: for an unknown task or algorithm, before anything is done; it names the nearest.
@@ -165,7 +175,13 @@ def benchmark(
                     episodes = min(_most_episodes(algorithm, task), part.episodes)
                     what: dict[str, Any] = {"task": task.name, "variant": part.variant, "algorithm": algorithm}
                     jobs.append(ResultJob(row=ResultRow(seed=seed, episodes=episodes, **what, **about), out=folder))
-    failures = run_jobs(jobs, folder / "jobs", on=on, workers=workers, watch=watch)
+    for job in jobs:
+        if job.is_done():
+            job.clear()
+    failures: list[Failure] = []
+    # what acts on a variant is in the row of its task
+    for wave in ([job for job in jobs if not job.row.variant], [job for job in jobs if job.row.variant]):
+        failures += run_jobs(wave, folder / "jobs", on=on, workers=workers, watch=watch) if wave else []
     keys = [key_of(job.row) for job in jobs]
     return BenchmarkOutcome(tuple(row for row in _rows(folder) if key_of(row) in keys), tuple(failures))
 

@@ -13,6 +13,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +23,7 @@ from filelock import FileLock
 
 from cirl_marl.errors import RunError
 from cirl_marl.jobs.work import JobFiles
-from cirl_marl.records.files import read_record, refuse_links, write_json, write_table
+from cirl_marl.records.files import PARTIAL, read_record, refuse_links, write_json, write_table
 from cirl_marl.sweeps.cells import Cell
 from cirl_marl.sweeps.reading import SweepFile, SweepOptions
 
@@ -51,7 +52,7 @@ class SweepFolder:
         refuse_links(self.path)
         now = self._description(request, cells)
         self.path.mkdir(parents=True, exist_ok=True)
-        with FileLock(self.path / ".asked.lock"):
+        with self._lock():
             if self._request_path.is_file():
                 self._check(now, self._stored_request())
             for cell in cells:
@@ -87,10 +88,15 @@ class SweepFolder:
         return [self.row(name) for name in self._stored_request()["cells"]]
 
     def write_table(self) -> list[dict[str, Any]]:
-        """Write the table of results, and return its rows."""
-        rows = self.rows()
-        write_table(self.table, list(rows[0]), ([row[key] for key in rows[0]] for row in rows))
+        """Write the table of results, and return its rows; whoever comes last has seen the results of all."""
+        with self._lock():
+            rows = self.rows()
+            write_table(self.table, list(rows[0]), ([row[key] for key in rows[0]] for row in rows))
         return rows
+
+    def _lock(self) -> FileLock:
+        """Return the lock of whoever writes what is not of one cell."""
+        return FileLock(self.path / ".asked.lock")
 
     def row(self, name: str) -> dict[str, Any]:
         """Return the row of a cell."""
@@ -117,8 +123,8 @@ class SweepFolder:
         return read_record(self._request_path)
 
     def _strangers(self) -> Iterator[str]:
-        names = {"cells", "bounds", "jobs", ".asked.lock", ".asked.partial.json"}
-        return (entry.name for entry in self.path.iterdir() if entry.name not in names)
+        names = {"cells", "bounds", "jobs", ".asked.lock"}
+        return (name for name in os.listdir(self.path) if name not in names and not PARTIAL.match(name))
 
     def _description(self, request: SweepFile, cells: Sequence[Cell]) -> dict[str, Any]:
         """Return what is asked for as JSON has it."""
