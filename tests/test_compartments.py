@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import pkgutil
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import fields
 from typing import Any
@@ -256,16 +254,6 @@ class TestRegistry:
         assert {module for kind, module in found.items() if kind not in DISCRETE} == modules - HELPERS
         assert {found[kind] for kind in DISCRETE} == {f"robots.{kind}" for kind in DISCRETE}
         assert all(model_class(kind) is model for kind, model in models().items())
-
-    def test_discovery_is_light(self) -> None:
-        """A kind that is no robot loads neither torch nor mujoco, and not even asking for what there is loads torch."""
-        code = (
-            "import sys, cirl_marl.compartments as c; heavy = {'torch', 'mujoco'};"
-            "c.model_class('digester'); print(*sorted(heavy & {*sys.modules}), end=';');"
-            "c.models(); print(*sorted(heavy & {*sys.modules}))"
-        )
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-        assert done.stdout.strip() == ";mujoco"
 
     def test_unknown_kind(self) -> None:
         """The error names the nearest match, robots included."""

@@ -106,10 +106,3 @@ def test_gymnasium_knows_them_whoever_comes_first(code: str, tmp_path: Path) -> 
     """In a checkout that is not installed, in either order of imports."""
     command = [sys.executable, "-W", "error", "-c", f"import sys; sys.path.insert(0, {str(ROOT)!r}); {code}.close()"]
     subprocess.run(command, check=True, cwd=tmp_path)
-
-
-def test_registering_reads_no_definition() -> None:
-    """The catalogue's files are read when a network is asked for."""
-    code = "import cirl_marl\nfrom cirl_marl.definitions import catalogue\nprint(catalogue._read.cache_info().misses)"
-    run = subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT, capture_output=True, text=True)
-    assert run.stdout.strip() == "0"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from itertools import combinations
@@ -83,18 +82,6 @@ def _settings_untouched() -> Iterator[None]:
     assert dict(matplotlib.rcParams) == before
     pyplot = sys.modules.get("matplotlib.pyplot")
     assert pyplot is None or not pyplot.get_fignums()
-
-
-@pytest.mark.medium
-def test_package_needs_no_matplotlib() -> None:
-    """Importing the library and stepping an environment leave this package, and pyplot with it, unloaded."""
-    code = (
-        "import sys, cirl_marl; env = cirl_marl.parallel_env('copper_net'); env.reset(seed=0); "
-        "env.step(env.neutral_action); assert 'matplotlib' not in sys.modules; "
-        "import cirl_marl.drawing.digraph, cirl_marl.report.curves; assert 'matplotlib.pyplot' not in sys.modules"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (0, ""), done.stderr
 
 
 @pytest.mark.sample(4)

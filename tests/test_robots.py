@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import pickle
-import subprocess
-import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -404,27 +402,6 @@ class TestRegistry:
         assert model_class("fetch") is Fetch
         with pytest.raises(CirlError, match="Did you mean 'reacher'"):
             model_class("reachers")
-
-    @pytest.mark.medium
-    def test_light_kinds_do_not_load_mujoco(self) -> None:
-        """Only asking for a robot imports MuJoCo; the station's class alone makes no engine."""
-        code = (
-            "import sys, cirl_marl; from cirl_marl.compartments import model_class; model_class('digester');"
-            "print('mujoco' in sys.modules); model_class('fetch'); print('mujoco' in sys.modules)"
-        )
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-        assert done.stdout.split() == ["False", "True"]
-        assert done.stderr == ""
-
-    @pytest.mark.medium
-    def test_catalogue_does_not_load_mujoco_or_torch(self) -> None:
-        """Loading a network without a robot, and stepping it, stays light."""
-        code = (
-            "import sys, cirl_marl; env = cirl_marl.parallel_env('copper_net'); env.reset(seed=0);"
-            "env.step(env.neutral_action); print([m for m in ('mujoco', 'torch') if m in sys.modules])"
-        )
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-        assert done.stdout.split() == ["[]"]
 
     def test_models_are_pickled_without_an_engine(self) -> None:
         """A model is its parameters, also after it has been used."""
