@@ -23,17 +23,17 @@ lint: $(VENV)/.dev
 types: $(VENV)/.dev
 	$(BIN)/mypy
 
-# two workers have two cores
+# two workers have two cores; what the tests of a file share is made in one of them
 fast unit every docs notebooks: export OMP_NUM_THREADS = 1
 
 fast: $(VENV)/.dev
-	$(BIN)/python -m pytest -q -n 2 -m 'not slow and not medium' tests
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'not slow and not medium' tests
 
 unit: $(VENV)/.dev
-	$(BIN)/python -m pytest -q -n 2 -m 'not slow'
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'not slow'
 
 every: $(VENV)/.dev $(VENV)/.docs
-	$(BIN)/python -m pytest -q -n 2 --hypothesis-profile=all
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --hypothesis-profile=all
 
 adapters: $(VENV)/.dev  ## contracts and examples of the adapters, each in an environment of its own (some minutes)
 	$(BIN)/python tests/adapters/run.py

@@ -11,6 +11,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
+from rich.console import Console
 from small_networks import city, with_lambda
 from test_each_service import town as scarce_town
 from test_supply import town
@@ -34,12 +36,16 @@ from cirl_marl import (
 )
 from cirl_marl.cli import app
 from cirl_marl.controllers import Constant
+from cirl_marl.controllers.basic import Neutral
 from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
 from cirl_marl.evaluation.account_front import AccountFront, _Sweep, _within_reach, volume_dominated
 from cirl_marl.network.elements import Role
 from cirl_marl.optimum import bound, improve_plan, simulate_plan, supply_limits
+from cirl_marl.optimum.aims import Budget
 from cirl_marl.optimum.bounds import tight_bound
 from cirl_marl.optimum.supply_limits import _with_ends, with_supply_limits
+from cirl_marl.report import account_tables
+from cirl_marl.report.account_tables import front_table, write_account_front
 
 
 @pytest.mark.slow
@@ -100,6 +106,7 @@ def test_two_services_that_need_the_same_are_weighed() -> None:
     assert (front.at(front.plans[:, 1:]) >= front.plans[:, 0] - 1e-6).all()
     proved, achieved = front.volumes
     assert 0.99 * proved <= achieved <= proved * (1 + 1e-6)
+    np.testing.assert_allclose(front.levels, np.minimum(front.plans.min(axis=1), 1.0), rtol=1e-9)
     level = front.demands[1, 0]
     nearby = [bound(network, aim="mobility", min_service=[0.0, level + way * 1e-3]).objective for way in (-1, 1)]
     slopes = np.diff([nearby[0], front.bounds[1], nearby[1]]) / 1e-3
@@ -197,7 +204,59 @@ def test_the_highest_service_is_had_at_the_least_of_the_other_aim() -> None:
     front = account_front(network, (network.services[0].id, "cost"), points=3)
     cheapest = -bound(network, aim="cost", min_service=front.bounds[-1] - 1e-6).objective
     assert front.demands[-1, 0] == pytest.approx(cheapest, rel=1e-4)
+    np.testing.assert_allclose(front.at(2 * front.demands[-1:]), front.bounds[-1], atol=1e-5)  # there is no more
     assert 1.0 - 1e-5 < _within_reach(1.0) < 1.0 and _within_reach(0.0) == 0.0
+
+
+def test_what_is_no_aim_is_demanded() -> None:
+    """A level that is asked for of all services is none of that which has demands of its own."""
+    levels: list[np.ndarray] = []
+
+    def noted(network: Network, axes: object, points: object, min_service: np.ndarray, progress: object) -> None:
+        levels.append(min_service)
+        raise CirlError("enough")
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(CirlError, match="enough"):
+        patch.setattr("cirl_marl.evaluation.account_front._Sweep", noted)
+        account_front(two_sources(), ("circularity", "living"), min_service=0.9)
+    assert dict(zip([service.id for service in two_sources().services], levels[0], strict=True)).pop("living") == 0.0
+    assert sorted(levels[0].tolist()) == [0.0, 0.9]
+
+
+def test_money_against_emissions_in_numbers_and_in_a_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Less of both is better: what is proved lies below what plans take; tables, files and picture say the same."""
+    network = corner()
+    front = account_front(network, ("cost", "emissions"), min_service=0.97, points=3)
+    assert front.signs.tolist() == [-1.0, -1.0] and front.units == ("EUR_2023", "t CO2e")
+    middle = bound(network, aim="cost", at_most={"emissions": front.demands[1, 0]}, min_service=0.97)
+    assert front.bounds[1] == pytest.approx(-middle.objective, rel=1e-6)
+    assert (np.diff(front.bounds) < 0).all() and (front.plans[:, 0] >= front.bounds - 1e-6).all()
+    usual = rollout(MultiAgentVectorEnv(network, num_envs=1), Neutral())
+    np.testing.assert_allclose(front.as_usual, usual.accounts[0], rtol=1e-12)
+    printer = Console(width=200)
+    with printer.capture() as shown:
+        printer.print(front_table(front))
+    rows = [
+        [cell.strip() for cell in line.strip("│┃").split("│" if "│" in line else "┃")]
+        for line in shown.get().splitlines()
+    ]
+    names = ["cost (EUR_2023)", "emissions (t CO2e)"]
+    header = ["emissions at most (t CO2e)", f"best {names[0]}", *(f"plan: {name}" for name in names)]
+    header.append("worth of emissions (EUR_2023/(t CO2e))")
+    assert header in rows
+    table = np.column_stack([front.demands, front.bounds, front.plans, front.prices])
+    assert [[f"{cell:.5g}" for cell in row] for row in table.tolist()] == [row for row in rows if len(row) == 5][1:]
+    drawn: list[Figure] = []
+    real = account_tables.save
+    monkeypatch.setattr(account_tables, "save", lambda figure, path: drawn.append(figure) or real(figure, path))
+    files = write_account_front(front, tmp_path / "front")
+    assert [path.name for path in files] == ["pareto.csv", "pareto.json", "pareto.png"]
+    record = json.loads(files[1].read_text(encoding="utf-8"))
+    assert record["hypervolume"] == dict(zip(("proved", "plans"), front.volumes, strict=True))
+    np.testing.assert_allclose(np.array(record["points"])[:, :5], table, rtol=1e-12)
+    (axes,) = drawn[0].axes
+    (shaded,) = (part.get_paths()[0].vertices[:, 1] for part in axes.collections)
+    assert shaded.min() == pytest.approx(axes.get_ylim()[0]) and shaded.max() < axes.get_ylim()[1]
 
 
 @pytest.mark.parametrize(
@@ -301,6 +360,17 @@ def test_nothing_is_limited_where_nothing_is_proved(monkeypatch: pytest.MonkeyPa
     assert with_supply_limits(poor, 1.01 * poor.objective) == scarce
     monkeypatch.setattr(supply_limits, "LARGE", 1)
     assert with_supply_limits(solution, solution.objective) is network
+    row = network.control_rows["mine_a"].start
+    least = _with_ends(network, {"mine_a": np.full(8, -1.0)})  # what is supplied while nothing lacks may always be
+    np.testing.assert_array_equal(least.control_bounds[2, row], network.control_bounds[1, row])
+
+
+def test_limits_of_supplies_hold_whatever_the_budget() -> None:
+    """They are of all episodes that are good enough, not of those alone that keep the budget of a bound."""
+    free = bound(corner(), min_service=0.95)
+    least = float(simulate_plan(improve_plan(free)).episode_circularity[0]) - 1.0
+    thrifty = replace(free, aims=replace(free.aims, budgets=(Budget(0, 1e-6, "cost"),)))
+    assert with_supply_limits(thrifty, least) == with_supply_limits(free, least)
 
 
 def corner() -> Network:
@@ -353,8 +423,15 @@ def corner() -> Network:
 @pytest.mark.parametrize("min_service", [0.95, 0.99])
 def test_limits_of_supplies_prove_nothing_of_worse_episodes(min_service: float) -> None:
     """Without recycling and reuse both are cheapest, though no episode of limited supplies can be like that."""
-    network = corner()
-    front = account_front(network, ("circularity", "cost", "emissions"), min_service=min_service, points=3)
+    network, shares = corner(), list[float]()
+    front = account_front(
+        network,
+        ("circularity", "cost", "emissions"),
+        min_service=min_service,
+        points=3,
+        progress=lambda activity, share: shares.append(share),
+    )
+    assert shares == sorted(shares) and shares[-1] == 1.0
     env = MultiAgentVectorEnv(network, num_envs=1)
     for recycling, reuse in itertools.product(np.linspace(-1.0, 1.0, 5).tolist(), repeat=2):
         run = rollout(env, Constant({"recycling": recycling, "reuse": reuse}))

@@ -213,14 +213,16 @@ def test_ctrl_c_before_a_command_begins(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_plan_and_compare(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """A controller's plan has units in its columns; a comparison without runs writes its four files."""
+    bottles()
     asked = ("--control", "neutral", "--out", "plan.csv", "--html", "plan.html")
-    assert run(monkeypatch, "plan", "carbo_net", *asked) == 0
+    assert run(monkeypatch, "plan", "bottles.toml", *asked) == 0
     told = shown(Path("plan.html").read_text(encoding="utf-8"))
     assert [scene["name"] for scene in told["scenes"]] == ["business as usual", "neutral"]
     header, *rows = Path("plan.csv").read_text().splitlines()
     assert header.startswith("from (day),to (day),")
-    assert len(rows) == 160
-    assert run(monkeypatch, "compare", "--network", "net_zero", "--controllers", "random", "--episodes", "2",
+    assert len(rows) == 7
+    short_net_zero(8)
+    assert run(monkeypatch, "compare", "--network", "short.toml", "--controllers", "random", "--episodes", "2",
                "--out", "out", "--html", "compared.html") == 0  # fmt: skip
     told = shown(Path("compared.html").read_text(encoding="utf-8"))
     assert [scene["name"] for scene in told["scenes"]] == ["business as usual", "random"]
@@ -272,7 +274,14 @@ def test_pareto(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[s
     assert run(monkeypatch, "pareto", "bottles.toml", *asked, "--html", "front.html") == 0
     told = shown(Path("front.html").read_text(encoding="utf-8"))
     assert {point["name"] for point in told["points"]} == {"plans", "trained", "business as usual"}
+    assert {point["name"] for point in told["points"] if point["about"]} == {"trained"}
     assert len(told["front"]) > 2
+    with Path("out/pareto.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["kind"] == "trained"]
+    assert [float(row["circularity weight"]) for row in rows] == [0.0, 1.0]
+    points = [(point["service"], point["lambda"]) for point in told["points"] if point["name"] == "trained"]
+    figures = [(float(row["least service level"]), float(row["circularity (t)"])) for row in rows]
+    np.testing.assert_allclose(figures, points, rtol=1e-5)
     printed = capsys.readouterr().out
     assert all(word in printed for word in ("bound    service", "plan     service", "(weight 1, seed 0)"))
     assert {path.name for path in Path("out").iterdir()} == {"pareto.csv", "pareto.json", "pareto.png", "runs"}
@@ -316,6 +325,14 @@ def test_infeasible_plan(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
     assert [path.name for path in Path().iterdir()] == ["bottles.toml"]
 
 
+def short_net_zero(intervals: int) -> None:
+    """Write ``short.toml``, the network of the catalogue of which nothing is proved, with a shorter episode."""
+    text = (folder("envs") / "net_zero.toml").read_text(encoding="utf-8")
+    Path("short.toml").write_text(
+        text.replace("horizon = { value = 120", f"horizon = {{ value = {intervals}"), encoding="utf-8"
+    )
+
+
 def test_plan_shows_how_far_the_search_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """The bar of ``cirl plan`` moves while the best plan is searched for, not only while it is carried out."""
     shares: list[float] = []
@@ -326,8 +343,7 @@ def test_plan_shows_how_far_the_search_is(monkeypatch: pytest.MonkeyPatch) -> No
 
     monkeypatch.setattr("cirl_marl.cli.common.bar", bar)
     monkeypatch.setattr("cirl_marl.optimum.open_loop.search_each", partial(search_each, population=8, iterations=2))
-    text = (folder("envs") / "net_zero.toml").read_text(encoding="utf-8")
-    Path("short.toml").write_text(text.replace("horizon = { value = 120", "horizon = { value = 24"), encoding="utf-8")
+    short_net_zero(24)
     assert run(monkeypatch, "plan", "short.toml", "--control", "optimum", "--out", "p.csv") == 0
     searching = [share for share in shares if share < 0.99]
     assert 3 * 20 < len(searching) < 3 * 100 and shares == sorted(shares) and shares[-1] == 1.0

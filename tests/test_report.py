@@ -285,7 +285,7 @@ def test_circularity_curves(tmp_path: Path, episodes: int) -> None:
 
 
 @pytest.mark.medium
-@pytest.mark.sample(3)
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("agents", [0, 1, 2, 7, 20, 33])
 def test_learning_curves(tmp_path: Path, agents: int) -> None:
     """Any number of agents and of episodes, none included."""

@@ -22,6 +22,7 @@ EVERYWHERE = PLAYED
 
 
 @pytest.mark.medium
+@pytest.mark.sample(12)
 @pytest.mark.parametrize(("name", "scenario"), EVERYWHERE)
 def test_plan_achieves_what_it_says_and_no_less_than_its_candidates(name: str, scenario: str | None) -> None:
     """In each network a lone copy that replays the plan earns the figures that it was chosen for."""

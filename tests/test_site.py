@@ -88,7 +88,7 @@ def test_network_pages_say_what_definitions_say(name: str) -> None:
 
 
 @pytest.mark.medium
-@pytest.mark.sample(2)
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("name", cirl_marl.networks())
 def test_kept_plans_are_of_the_catalogue(name: str) -> None:
     """Each network has a bound and a plan of its definition as it is now, and the bound is not exceeded."""
@@ -163,17 +163,21 @@ def test_model_pages_list_states_inputs_and_parameters() -> None:
     assert "compartments.md#digester-digester_published" in model_page("digester_published").text
 
 
-@pytest.mark.medium
-def test_recipe_pages_list_every_setting() -> None:
-    """Of every recipe: settings of the run, parameters of all learners, and the file itself."""
-    for name in cirl_marl.recipes():
-        recipe, text = load_recipe(name), recipe_page(name).text
-        said = {row[0].strip("`") for row in cells(text)}
-        assert said >= {f"run.{key}" for key in recipe.run.model_dump()}
-        for where, learner in recipe.learners():
-            assert said >= {f"{where}.parameters.{key}" for key in learner.parameters}
-        assert (ROOT / "agents" / f"{name}.toml").read_text().strip() in text
-        assert_it_parses(re.findall(r"^```\ncirl (.*)$", text, re.M)[0])
+@pytest.mark.sample(4)
+@pytest.mark.parametrize("name", cirl_marl.recipes())
+def test_recipe_pages_list_every_setting(name: str) -> None:
+    """Settings of the run, parameters of all learners, and the file itself."""
+    recipe, text = load_recipe(name), recipe_page(name).text
+    said = {row[0].strip("`") for row in cells(text)}
+    assert said >= {f"run.{key}" for key in recipe.run.model_dump()}
+    for where, learner in recipe.learners():
+        assert said >= {f"{where}.parameters.{key}" for key in learner.parameters}
+    assert (ROOT / "agents" / f"{name}.toml").read_text().strip() in text
+    assert_it_parses(re.findall(r"^```\ncirl (.*)$", text, re.M)[0])
+
+
+def test_recipe_pages_name_the_command_that_trains() -> None:
+    """That of the paper, and that of the network for which a recipe is."""
     assert "cirl paper Incinerator --recipe tuned" in recipe_page("paper_incinerator").text
     assert "cirl train solids_net --recipe sorter_alone" in recipe_page("sorter_alone").text
 

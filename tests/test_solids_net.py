@@ -185,7 +185,7 @@ def staged(found: list[Stages], time: Floats, interval: float) -> Floats:
     return total
 
 
-@pytest.mark.sample(4)
+@pytest.mark.sample(2)
 @both
 @controlled
 def test_circularity_is_the_sum_of_the_stages(scenario: str, name: str) -> None:
@@ -453,7 +453,7 @@ def one_batch(window: int) -> Network:
     return replace(network, arcs=(first_use, replace(recycling, delay=4.0), truck))
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(1)
 @pytest.mark.parametrize(
     ("controller", "sorted_items"), [(ScriptController({"sorter": 0.0}), 0), (Mixed(0), 1), (ScriptController(), 3)]
 )

@@ -660,7 +660,6 @@ def test_bounds_allow_all_that_may_be_supplied() -> None:
     merged=st.booleans(),
     seed=st.integers(0, 99),
 )
-@settings(max_examples=20)
 def test_supplies_keep_the_proportions_that_the_program_knows(
     weight: float, high: tuple[float, float], ore: float, merged: bool, seed: int
 ) -> None:

@@ -38,7 +38,14 @@ def emitting(horizon: int) -> Network:
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("at_most", [{"emissions": 2.5}, {"cost/year": 4.0}, {"emissions": 2.5, "cost/year": 4.5}])
+@pytest.mark.parametrize(
+    "at_most",
+    [
+        pytest.param({"emissions": 2.5}, marks=pytest.mark.slow),
+        pytest.param({"cost/year": 4.0}, marks=pytest.mark.slow),
+        {"emissions": 2.5, "cost/year": 4.5},
+    ],
+)
 def test_with_budgets_too_the_bound_is_that_of_all_paths_at_once(at_most: dict[str, float]) -> None:
     """With the multipliers of the extensive form it is its optimum; with others never less, with fitted ones near."""
     network = emitting(3)
