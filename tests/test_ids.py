@@ -97,9 +97,8 @@ def test_an_old_version_names_its_successor(planted: None, monkeypatch: pytest.M
     "code",
     [
         "import cirl_marl, gymnasium; gymnasium.make('cirl_marl/net_zero-v0')",
-        "import gymnasium, cirl_marl; gymnasium.make('cirl_marl/net_zero-v0')",
-        "import gymnasium; gymnasium.make('cirl_marl:cirl_marl/net_zero.droop-v0')",
-        "import gymnasium; gymnasium.make_vec('cirl_marl:cirl_marl/CopperNet-v0', num_envs=2)",
+        "import gymnasium; gymnasium.make('cirl_marl:cirl_marl/net_zero.droop-v0').close(); "
+        "gymnasium.make_vec('cirl_marl:cirl_marl/CopperNet-v0', num_envs=2)",
     ],
 )
 def test_gymnasium_knows_them_whoever_comes_first(code: str, tmp_path: Path) -> None:

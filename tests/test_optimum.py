@@ -492,6 +492,7 @@ def test_bad_envelopes(starts: list[float], solves: int, said: str) -> None:
 
 
 @pytest.mark.medium
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("name", ["copper_net", "carbo_net"])
 def test_plan_comes_close_to_the_bound(name: str) -> None:
     """Ten days of each network: the improved plan keeps the service and 99 % of the bound; neutral control does not."""
