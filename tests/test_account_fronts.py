@@ -8,6 +8,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -363,6 +364,24 @@ def test_nothing_is_limited_where_nothing_is_proved(monkeypatch: pytest.MonkeyPa
     row = network.control_rows["mine_a"].start
     least = _with_ends(network, {"mine_a": np.full(8, -1.0)})  # what is supplied while nothing lacks may always be
     np.testing.assert_array_equal(least.control_bounds[2, row], network.control_bounds[1, row])
+
+
+def test_intervals_are_proved_together_where_the_nearest_end_is_out_of_reach(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of what is supplied beyond the least: 5 in two intervals come to neither end of 10, but may come to one of 4."""
+    costs: list[np.ndarray] = []
+    monkeypatch.setattr(supply_limits, "replace", lambda problem, cost: costs.append(cost) or problem)
+    monkeypatch.setattr(supply_limits, "solve", lambda *arguments, **options: SimpleNamespace(certificate=0, plan=0))
+    monkeypatch.setattr(supply_limits, "verify", lambda *arguments: SimpleNamespace(bound=5.0))
+    layout = SimpleNamespace(size=3, flow=np.array([0, 1]), moments=range(2))
+    problem: Any = SimpleNamespace(layout=layout, cost=np.zeros(6))
+
+    def proved(low: float, room: list[float]) -> list[int]:
+        first, least = np.zeros(2, dtype=np.intp), np.full((2, 1), low)
+        return supply_limits._below(problem, [0, 1], first, least, np.array(room))
+
+    assert proved(0.0, [10.0, 10.0]) == [0, 1] and proved(0.0, [10.0, 4.0]) == [0]
+    assert proved(1.0, [10.0, 4.0]) == [0, 1]
+    np.testing.assert_array_equal(costs[0], [-0.5, -0.5, 0.0] * 2)  # the mean flows of both intervals
 
 
 def test_limits_of_supplies_hold_whatever_the_budget() -> None:

@@ -199,6 +199,11 @@ class Killed(BaseException):
     """What no job survives."""
 
 
+HALF = SimpleNamespace(value=0.5, low=0.4, high=0.6)
+MEASURED = SimpleNamespace(circularity=HALF, service=HALF, gap=HALF)
+"""Figures of tests of when something is measured."""
+
+
 def test_kills_lose_nothing_and_double_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Wherever a benchmark is killed, the same call goes on: one training, one row, and no training is left behind."""
     trainings, options = list[Path](), {"algorithms": ["ppo"], "seeds": [401], "out": tmp_path}
@@ -217,6 +222,7 @@ def test_kills_lose_nothing_and_double_nothing(tmp_path: Path, monkeypatch: pyte
         raise Killed
 
     monkeypatch.setattr(interface, "train", counted)
+    monkeypatch.setattr(declared.BenchmarkTask, "measure", lambda *arguments, **options: MEASURED)
     for place, name in ((row_jobs, "write_weights"), (declared.BenchmarkTask, "measure"), (row_jobs, "add_rows")):
         with monkeypatch.context() as patch, pytest.raises(Killed):
             patch.setattr(place, name, killed)
@@ -234,9 +240,7 @@ def test_kills_lose_nothing_and_double_nothing(tmp_path: Path, monkeypatch: pyte
 
 def test_policies_act_on_variants_when_there_are_some(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Several rows may be made at a time, so that those of variants are begun when the others are there."""
-    figure = SimpleNamespace(value=0.5, low=0.4, high=0.6)
-    figures = SimpleNamespace(circularity=figure, service=figure, gap=figure)
-    monkeypatch.setattr(declared.BenchmarkTask, "measure", lambda *arguments, **options: figures)
+    monkeypatch.setattr(declared.BenchmarkTask, "measure", lambda *arguments, **options: MEASURED)
     monkeypatch.setattr(row_jobs, "run_jobs", lambda jobs, *rest, **options: run_jobs(jobs[::-1], *rest, **options))
     outcome = cirl_marl.benchmark([TASK], algorithms=["mpc"], out=tmp_path, held_out=True)
     assert not outcome.failures and [row.variant for row in outcome.rows] == [0, 1, 2, 3]
