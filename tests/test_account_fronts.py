@@ -249,14 +249,19 @@ def test_money_against_emissions_in_numbers_and_in_a_picture(tmp_path: Path, mon
     assert [[f"{cell:.5g}" for cell in row] for row in table.tolist()] == [row for row in rows if len(row) == 5][1:]
     drawn: list[Figure] = []
     real = account_tables.save
-    monkeypatch.setattr(account_tables, "save", lambda figure, path: drawn.append(figure) or real(figure, path))
+
+    def noted(figure: Figure, path: Path) -> Path:
+        drawn.append(figure)
+        return real(figure, path)
+
+    monkeypatch.setattr(account_tables, "save", noted)
     files = write_account_front(front, tmp_path / "front")
     assert [path.name for path in files] == ["pareto.csv", "pareto.json", "pareto.png"]
     record = json.loads(files[1].read_text(encoding="utf-8"))
     assert record["hypervolume"] == dict(zip(("proved", "plans"), front.volumes, strict=True))
     np.testing.assert_allclose(np.array(record["points"])[:, :5], table, rtol=1e-12)
     (axes,) = drawn[0].axes
-    (shaded,) = (part.get_paths()[0].vertices[:, 1] for part in axes.collections)
+    (shaded,) = (np.asarray(part.get_paths()[0].vertices)[:, 1] for part in axes.collections)
     assert shaded.min() == pytest.approx(axes.get_ylim()[0]) and shaded.max() < axes.get_ylim()[1]
 
 
@@ -369,7 +374,12 @@ def test_nothing_is_limited_where_nothing_is_proved(monkeypatch: pytest.MonkeyPa
 def test_intervals_are_proved_together_where_the_nearest_end_is_out_of_reach(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of what is supplied beyond the least: 5 in two intervals come to neither end of 10, but may come to one of 4."""
     costs: list[np.ndarray] = []
-    monkeypatch.setattr(supply_limits, "replace", lambda problem, cost: costs.append(cost) or problem)
+
+    def with_cost(problem: object, cost: np.ndarray) -> object:
+        costs.append(cost)
+        return problem
+
+    monkeypatch.setattr(supply_limits, "replace", with_cost)
     monkeypatch.setattr(supply_limits, "solve", lambda *arguments, **options: SimpleNamespace(certificate=0, plan=0))
     monkeypatch.setattr(supply_limits, "verify", lambda *arguments: SimpleNamespace(bound=5.0))
     layout = SimpleNamespace(size=3, flow=np.array([0, 1]), moments=range(2))

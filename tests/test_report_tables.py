@@ -173,7 +173,12 @@ def _page_episode(network: Network) -> Any:
 def test_ages_at_the_start_and_at_the_end_are_told_apart(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Bars are what is there at the end, the outline is what was there before."""
     drawn: list[Figure] = []
-    monkeypatch.setattr(trajectory, "save", lambda figure, path: drawn.append(figure) or path)
+
+    def noted(figure: Figure, path: Path) -> Path:
+        drawn.append(figure)
+        return path
+
+    monkeypatch.setattr(trajectory, "save", noted)
     mass = np.array([[5.0, 1.0], [3.0, 3.0], [2.0, 4.0]])
     trajectory.save_pyramids(tmp_path / "ages.png", loop(), [Pyramid("use", 1.0, mass)], title="")
     (panel,) = drawn[0].axes
