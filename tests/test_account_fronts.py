@@ -39,6 +39,7 @@ from cirl_marl.cli import app
 from cirl_marl.controllers import Constant
 from cirl_marl.controllers.basic import Neutral
 from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
+from cirl_marl.drawing.style import save
 from cirl_marl.evaluation.account_front import AccountFront, _Sweep, _within_reach, volume_dominated
 from cirl_marl.network.elements import Role
 from cirl_marl.optimum import bound, improve_plan, simulate_plan, supply_limits
@@ -107,6 +108,7 @@ def test_two_services_that_need_the_same_are_weighed() -> None:
     assert (front.at(front.plans[:, 1:]) >= front.plans[:, 0] - 1e-6).all()
     proved, achieved = front.volumes
     assert 0.99 * proved <= achieved <= proved * (1 + 1e-6)
+    assert front.units == ("1", "1") and front.signs.tolist() == [1.0, 1.0]
     np.testing.assert_allclose(front.levels, np.minimum(front.plans.min(axis=1), 1.0), rtol=1e-9)
     level = front.demands[1, 0]
     nearby = [bound(network, aim="mobility", min_service=[0.0, level + way * 1e-3]).objective for way in (-1, 1)]
@@ -248,11 +250,10 @@ def test_money_against_emissions_in_numbers_and_in_a_picture(tmp_path: Path, mon
     table = np.column_stack([front.demands, front.bounds, front.plans, front.prices])
     assert [[f"{cell:.5g}" for cell in row] for row in table.tolist()] == [row for row in rows if len(row) == 5][1:]
     drawn: list[Figure] = []
-    real = account_tables.save
 
     def noted(figure: Figure, path: Path) -> Path:
         drawn.append(figure)
-        return real(figure, path)
+        return save(figure, path)
 
     monkeypatch.setattr(account_tables, "save", noted)
     files = write_account_front(front, tmp_path / "front")

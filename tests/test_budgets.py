@@ -182,7 +182,8 @@ def test_a_budget_of_nothing_has_a_price() -> None:
 def test_what_is_left_of_the_last_plan_is_tried_first() -> None:
     """In each interval that both plan; in those that come after it goes on as it ends."""
     tried: list[Any] = []
-    control, kept = MPC(min_service=0.5), SimpleNamespace()
+    control = MPC(min_service=0.5)
+    kept: Any = SimpleNamespace()
     control._climbs = False
 
     def better_of(plan: object, actions: list[NDArray[np.float64]]) -> Any:
