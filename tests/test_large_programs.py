@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from types import SimpleNamespace
 from typing import Any
 
 import highspy
@@ -279,6 +280,25 @@ def test_a_middling_program_leaves_its_basis_and_takes_a_plan_whose_multipliers_
     with pytest.raises(solver.SolverFailure):
         solver.solve(problem, basis, certify=False)
     assert tried == [(settings, None) for settings in attempts]
+
+
+@pytest.mark.parametrize(
+    ("values", "fits"), [([1.0, 0.5], True), ([0.0, 0.5], False), ([2.0, 0.5], False), ([1.0, 3.0], False)]
+)
+def test_values_fit_that_miss_no_row_and_no_box(values: list[float], fits: bool) -> None:
+    """Whatever the solver says of them: with x = 1 and y ≤ 4 too little, too much and what is out of its box do not."""
+    rows = sparse.csr_array(np.eye(2))
+    problem = program.LinearProgram(
+        cost=np.ones(2),
+        equal=rows[[0]],
+        equal_to=np.ones(1),
+        under=rows[[1]],
+        under_to=np.full(1, 4.0),
+        low=np.zeros(2),
+        high=np.full(2, 2.0),
+    )
+    answer: Any = SimpleNamespace(getSolution=lambda: SimpleNamespace(col_value=values))
+    assert solver._ScaledProgram(problem, np.ones(2)).is_feasible(answer) == fits
 
 
 @pytest.mark.parametrize(("distance", "count"), [(0.5 * solver.FAIR, 3), (2.0 * solver.FAIR, 4)])
