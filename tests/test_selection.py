@@ -85,6 +85,31 @@ def test_policies_between_serve_just_enough(
     assert len(seen) == 2
 
 
+@pytest.mark.parametrize("share", [1.0, 0.5])
+@pytest.mark.parametrize("engine", ["lockstep", "stacked", "gradients"])
+def test_the_last_update_is_evaluated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: str, share: float
+) -> None:
+    """Nothing is learnt after the last evaluation, so that policies that all updates made can act; steps come once."""
+    seen: list[np.ndarray] = []
+
+    def score(env: MultiAgentVectorEnv, policies: Policies, aims: object) -> Score:
+        seen.append(numbers(policies.policies["mine"]))
+        return Score(float(len(seen)), 1.0, 1.0, 0.0)
+
+    monkeypatch.setattr(trainer, "validation_score", score)
+    monkeypatch.setattr(trainer, "StackedPolicies", lambda all_, _: Policies({k: v.policy for k, v in all_.items()}))
+    learner = recipe().learner.model_copy(update={"share_of_steps": share})
+    given = recipe(engine=engine, min_service=0.99).model_copy(update={"learner": learner})
+    training = train("copper_net", given, directory=tmp_path / "run", horizon=HORIZON, circularity="mean")
+    last = numbers(training.learners["mine"].policy)
+    np.testing.assert_array_equal(seen[-1], last)
+    assert not np.array_equal(seen[-2], last)
+    steps = [row["joint_step"] for row in evaluations(RunDirectory(tmp_path / "run"))]
+    assert steps == [6 * k for k in range(1, int(8 * share) + 1)]
+    np.testing.assert_array_equal(numbers(Trained(tmp_path / "run").policies["mine"]), last)
+
+
 @pytest.mark.medium
 @pytest.mark.sample(2)
 @pytest.mark.parametrize("demanded", [None, 0.0, 0.97, 1.0])

@@ -129,7 +129,8 @@ class Training:
             self._validation_env = MultiAgentVectorEnv(
                 env.network, num_envs=run_settings.episodes if env.is_random else 1, agents=env.agents, **config.options
             )
-        self._last_evaluation = -1
+        # from here on only what all updates have made is evaluated, once nobody learns any more
+        self._last_steps = max(group.spec.steps_of(config.steps) for group in self.groups.values()) // config.envs
         self._checkpoint_folder: Path | None = None
         self._stack_names: Container[str] = ()
         self._due, self._saved_at, self._checkpoint_seconds = False, time.monotonic(), 0.0
@@ -254,15 +255,14 @@ class Training:
         total_steps = self.config.steps // copies
         if self.config.recipe.run.evaluations:
             interval = max(self.env.network.episode.horizon, total_steps // self.config.recipe.run.evaluations)
-            if steps % interval == 0:
+            if steps % interval == 0 and steps < self._last_steps:
                 self._evaluate()
         if steps % max(1, total_steps // CHECKPOINTS) == 0:
             self._due = True
 
     def finish(self) -> None:
         """Evaluate what was learnt in the end, and keep it."""
-        if self._last_evaluation != self.joint_steps:
-            self._evaluate()
+        self._evaluate()
         self._bring_up_to_date()
         if self.run is not None:
             self._try_between(self.run)
@@ -344,7 +344,7 @@ class Training:
         self._bring_up_to_date()
         policies = StackedPolicies(self.learners, self._stacks)
         score = validation_score(self._validation_env, policies, self._aims)
-        self._last_evaluation, self._last_score = self.joint_steps, score
+        self._last_score = score
         better = self._keep_if_best(score)
         if self._evaluations is not None:
             steps = (self.joint_steps, self.joint_steps * self.config.envs)
