@@ -81,11 +81,6 @@ class StepColumns:
         """Convex parts of accounts, shape (steps, controls + excesses)."""
         return np.concatenate([self.effort, self.excess], axis=1)
 
-    @property
-    def own(self) -> Integers:
-        """What rows of an interval measure by, beside moves, shape (steps, services + 1)."""
-        return np.concatenate([self.level, self.imbalance], axis=1)
-
 
 class _Rows:
     """Rows G v ≤ h of some variables, block by block."""
@@ -217,7 +212,7 @@ def step_program(
             cost_later[past] += span.later.cost[t] @ response
         levels = np.maximum(run.levels[0, :, t], demand) if is_leap else run.levels[0, :, t]
         block, room, near = measures.rows(t, levels, end, response, furthest[past])
-        measure_rows.add(block, np.append(past, columns.own[t]), room)
+        measure_rows.add(block, np.concatenate([past, columns.level[t], columns.imbalance[t]]), room)
         places.append(np.stack([np.full_like(near, t), near], axis=1))
         block, room = supplies.rows_of(t, measures.by_stage[:services] @ response)
         part_rows.add(block, past, room)
