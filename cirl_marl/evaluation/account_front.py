@@ -152,6 +152,7 @@ def account_front(
     levels[[service.id in axes for service in definition.services]] = 0.0
     sweep = _Sweep(definition, tuple(axes), points, levels, progress)
     sweep.run(tuple(axes), {}, levels)
+    progress("bounds and plans", 1.0)  # there are fewer points where an aim has a single value
     if len(sweep.solutions) == 1:
         ends = " and ".join(f"{axis} {value:.6g}" for axis, value in zip(axes[1:], sweep.demands[0], strict=True))
         raise CirlError(
