@@ -391,7 +391,7 @@ def chained(seed: int) -> Network:
 
 
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=15)
+@settings(max_examples=8)
 def test_chains_of_stores_move_what_the_sparse_sum_does(seed: int) -> None:
     """Stages whose rates an agent sets move along slices of rows, all of them; without, flows are the same."""
 
@@ -414,7 +414,7 @@ def test_chains_of_stores_move_what_the_sparse_sum_does(seed: int) -> None:
 
 
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=10)
+@settings(max_examples=6)
 def test_many_copies_move_along_chains_as_few_do(seed: int) -> None:
     """To the bit: many take slices of rows, few the sparse sum."""
     network, rng = chained(seed), np.random.default_rng(seed)

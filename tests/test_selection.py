@@ -85,8 +85,7 @@ def test_policies_between_serve_just_enough(
     assert len(seen) == 2
 
 
-@pytest.mark.parametrize("share", [1.0, 0.5])
-@pytest.mark.parametrize("engine", ["lockstep", "stacked", "gradients"])
+@pytest.mark.parametrize(("engine", "share"), [("lockstep", 0.5), ("stacked", 1.0), ("gradients", 0.5)])
 def test_the_last_update_is_evaluated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: str, share: float
 ) -> None:
