@@ -55,20 +55,22 @@ class TaskBound:
         return np.asarray((self.values[: len(merit)] - merit) / self.scale)
 
     def write(self, path: Path) -> None:
-        """Write the file, and beside it the names of rows."""
+        """Write the file, and beside it the names of rows, if it has multipliers."""
         arrays = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
-        for place, names in ((path, [*arrays][:-1]), (rows_path(path), ["rows"])):
-            _save(place, {name: arrays[name] for name in names})
+        rows = arrays.pop("rows")
+        _save(path, arrays)
+        if len(self.equal):
+            _save(rows_path(path), {"rows": rows})
 
     @classmethod
     def read(cls, path: Path) -> TaskBound:
         """Read the file, and the names of rows beside it; a ``RunError`` if one is something else."""
         place = path
         try:
-            parts: dict[str, Any] = {}
-            for place in (path, rows_path(path)):
-                with np.load(place, allow_pickle=False) as arrays:
-                    parts |= {name: part if part.ndim else float(part) for name, part in arrays.items()}
+            parts = {"rows": np.zeros(0)} | _load(place)
+            if len(parts["equal"]):
+                place = rows_path(path)
+                parts |= _load(place)
             return cls(**{field.name: parts[field.name] for field in fields(cls)})
         except (OSError, ValueError, KeyError) as error:
             raise RunError(f"{place}: is not the bound of a task: {error!r}") from error
@@ -126,6 +128,11 @@ def _of_rows(present: Floats, names: Floats, multipliers: Floats) -> Floats:
     under = np.zeros(len(present))
     np.add.at(under, row[is_same], multipliers[is_same])
     return under
+
+
+def _load(path: Path) -> dict[str, Any]:
+    with np.load(path, allow_pickle=False) as arrays:
+        return {name: part if part.ndim else float(part) for name, part in arrays.items()}
 
 
 def _save(path: Path, arrays: dict[str, Floats]) -> None:
