@@ -34,11 +34,14 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network import Floats
 from cirl_marl.network.elements import Lifetime
 from cirl_marl.optimum import NoCertificate, Plan, bound, improve, improve_plan, program, search, simulate_plan, solver
-from cirl_marl.optimum.linearised import StepProgram, step_program
+from cirl_marl.optimum.aims import NO_AIMS
+from cirl_marl.optimum.linearised import Span, StepProgram, step_program
 from cirl_marl.optimum.mpc import MPC
 from cirl_marl.optimum.planned_episodes import starting_states
 from cirl_marl.optimum.slopes import jacobians
+from cirl_marl.optimum.window_climb import WindowActions, WindowEpisode
 from cirl_marl.optimum.window_planner import WindowPlanner
+from cirl_marl.optimum.window_simulator import WindowSimulator
 from cirl_marl.optimum.windows import WindowPlan, WindowTask
 
 KILOTONNES = {"kg": 1e6, "kt": 1.0, "Gt": 1e-6}
@@ -439,3 +442,24 @@ def test_multipliers_of_merged_pieces_bound_other_starts(monkeypatch: pytest.Mon
     assert solved.at(found.initial) >= found.objective - 1e-6 * abs(found.objective)
     run = simulate_plan(solved)
     assert run.episode_circularity[0] <= solved.objective
+
+
+def test_the_program_of_a_step_reads_the_intervals_of_its_span() -> None:
+    """A plan that begins later has the bands of its own years, and what may not change does not."""
+    network, first, steps = load_network("steel_japan").with_options(episode={"horizon": 6}), 3, 3
+    dynamics = Dynamics(network)
+    initial = bound(network, min_service=0.5, degree=1).initial
+    actions = np.zeros((steps, len(MultiAgentVectorEnv(network, num_envs=1).actuators.control_rows)))
+    plan = WindowActions(network, (), initial, actions, None, NO_AIMS)
+    stock, flow = WindowSimulator(dynamics, ()).run(initial, actions, first)
+    services, arcs = len(network.services), len(network.arcs)
+    run = WindowEpisode(0.0, np.ones((1, services, steps)), stock[1:], flow[:, :arcs], *np.empty((2, 1, 0)))
+    demand, span = np.ones(services), Span(first, free=1)
+    step = step_program(plan, dynamics, run, demand, demand, 2.0, jacobians(plan, dynamics, first), span=span)
+    for row, (t, service) in enumerate(step.place.tolist()):
+        if service < services:
+            least = network.interval_means(network.services[service].low)[first + t]
+            assert step.problem.under[[row]].toarray()[0, step.columns.level[t, service]] == pytest.approx(least)
+    for ends in (step.problem.low, step.problem.high):
+        assert (ends[step.columns.action[0]] != 0).any() and (ends[step.columns.action[1:]] == 0).all()
+    assert len(step.place) > 3
