@@ -30,7 +30,9 @@ from cirl_marl.controllers.rollout import rollout
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.network import Floats
 from cirl_marl.optimum import Bound, bound, improve, improve_plan, simulate_plan
+from cirl_marl.optimum.linearised import step_program
 from cirl_marl.optimum.slopes import jacobians
+from cirl_marl.optimum.solver import best_values
 from cirl_marl.optimum.step_supplies import IdleSupplies
 
 AGENTS = ("recycle", "exports")
@@ -285,3 +287,21 @@ def test_the_plan_that_is_least_short_counts(monkeypatch: pytest.MonkeyPatch) ->
     assert best.actions == pytest.approx(0.1)
     assert len(solved) == 4 * improve.EXTENSION
     assert price[0] > 1
+
+
+def test_a_step_lets_supplies_fall_and_no_further_than_to_nothing() -> None:
+    """Beside a budget that needs less of them, within what their arcs can bring; in the episode as in the program."""
+    network = harbour()
+    most = kept_by(network, 0.25)
+    solved = bound(network, agents=AGENTS, min_service=0.9, at_most={"emissions/year": most})
+    plan, dynamics = replace(solved, actions=np.full_like(solved.actions, -0.5)), Dynamics(network)
+    slopes, run = jacobians(plan, dynamics), simulate_plan(plan)
+    services, budgets = len(network.services), len(plan.aims.budgets)
+    prices = np.full(services + budgets, 10.0)
+    program = step_program(plan, dynamics, run, np.full(services, 0.9), prices, 1.0, slopes)
+    values = best_values(program.problem, program.scale)
+    assert values is not None
+    change, supplies = values[program.columns.supply], slopes.supplies
+    assert change.min() < -0.1
+    assert (change >= supplies.low - 1e-6).all() and (change <= supplies.high + 1e-6).all()
+    assert (supplies.amount + change >= -1e-5 * supplies.size).all()
