@@ -50,6 +50,7 @@ from cirl_marl.optimum.options import by_stage, with_margin
 from cirl_marl.optimum.program import LARGE, Programs
 from cirl_marl.optimum.slopes import jacobians
 from cirl_marl.optimum.solver import solve
+from cirl_marl.optimum.step_measures import Measures
 from cirl_marl.optimum.window_climb import climb_window
 from cirl_marl.optimum.window_planner import Future
 from cirl_marl.optimum.window_simulator import WindowSimulator
@@ -623,3 +624,24 @@ def test_a_plan_that_comes_about_needs_no_correction() -> None:
     window = control._plans[0].window
     assert window is not None
     np.testing.assert_allclose(window.corrections[0].error, 0.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("band", [(0.08, np.inf), (0.0, 0.03)])
+def test_levels_of_contents_in_a_step_are_those_of_the_episode_to_first_order(band: tuple[float, float]) -> None:
+    """Where too little or too much is in what flows, a row says how its level changes with each action."""
+    network = blending(*band)
+    solution = bound(network, min_service=0.0)
+    plan = replace(solution, actions=np.zeros_like(solution.actions))
+    dynamics, run = Dynamics(network), simulate_plan(plan)
+    slopes, measures = jacobians(plan, dynamics), Measures.of(network, dynamics, slice(0, 2), 0.0)
+    (content,), level = measures.contents, run.levels[0, 1]
+    assert 0.2 < level[0] < 0.9
+    response = next(slopes.responses())
+    table, limit, of_level = content.row(0, level[0], slopes.end[0], response)
+    assert limit / of_level == pytest.approx(level[0], rel=1e-9)
+    for size in (1e-4, -1e-4):
+        for k in range(plan.actions.shape[1]):
+            actions = plan.actions.copy()
+            actions[0, k] = size
+            change = simulate_plan(replace(plan, actions=actions)).levels[0, 1, 0] - level[0]
+            assert change == pytest.approx(-table[k] * size / of_level, rel=1e-3) and change != 0
