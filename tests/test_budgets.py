@@ -19,6 +19,7 @@ from cirl_marl import (
     MultiAgentVectorEnv,
     Network,
     Trained,
+    load_network,
     load_recipe,
     parallel_env,
     train,
@@ -404,3 +405,15 @@ def test_a_smoother_plan_may_book_what_the_last_one_did() -> None:
     assert centre.run.accounts[0, 1] > 1.05 * least > reference.run.accounts[0, 1] * 0.999
     margin = np.zeros_like(reference.run.levels[0])
     assert smooth._nearer(centre, reference, dynamics, distance, 1e9, 1e-6, margin, restore=False) is not None
+
+
+def test_of_drawn_numbers_nothing_is_said_to_be_out_of_reach() -> None:
+    """What a program of their means cannot keep an episode of others may; without draws it is said."""
+    network = load_network("copper_world", scenario="factor_ranges").with_options(episode={"horizon": 3})
+    for uncertain in (False, True):
+        control = MPC(min_service=0.9, at_most={"emissions": 1.0})
+        env = MultiAgentVectorEnv(network, num_envs=1, uncertain=uncertain)
+        env.reset(seed=0)
+        control.start(env, 0)
+        assert "more emissions" in control.note
+        assert ("no actions keep the budget of emissions" in control.note) != uncertain

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partialmethod
 from pathlib import Path
 from types import SimpleNamespace
@@ -460,3 +460,18 @@ def test_measure_takes_policies_of_ones_own() -> None:
     figures = load_task(TASK).measure(Neutral(), episodes=3)
     assert figures.gap.value > 0
     assert 0 < figures.service.value <= 1
+
+
+def test_a_bound_of_draws_is_one_file(tmp_path: Path) -> None:
+    """It has no multipliers whose rows had names; a certificate without its names is refused."""
+    for name, files in (("paper_city.breakdowns-v0", 1), ("paper_city-v0", 2)):
+        bound, path = TaskBound.read(load_task(name).bound_path), tmp_path / name / "bound.npz"
+        path.parent.mkdir()
+        bound.write(path)
+        assert len([*path.parent.iterdir()]) == files
+        again = TaskBound.read(path)
+        for field in fields(TaskBound):
+            np.testing.assert_array_equal(getattr(again, field.name), getattr(bound, field.name))
+    rows_path(path).unlink()
+    with pytest.raises(RunError, match=r"bound\.rows\.npz: is not the bound of a task"):
+        TaskBound.read(path)
