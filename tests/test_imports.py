@@ -57,6 +57,7 @@ def test_imports_go_one_way() -> None:
     assert max(floors(rooms(graph)).values()) <= MOST_FLOORS
 
 
+@pytest.mark.sample(1)
 @pytest.mark.medium
 @pytest.mark.parametrize(
     ("module", "line"),

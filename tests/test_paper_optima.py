@@ -123,6 +123,7 @@ def burn(env: MultiAgentVectorEnv) -> Floats:
     return best
 
 
+@pytest.mark.sample(2)
 @pytest.mark.medium
 @pytest.mark.parametrize(
     ("name", "best", "within"),

@@ -313,6 +313,7 @@ def test_failure_names_the_agent_and_keeps_what_was_learnt(tmp_path: Path, ppo_r
     assert set(controller.act(env.reset(seed=0))) == set(env.agents)
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("which", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_interruption_saves_and_resumption_finishes(
     which: int, tmp_path: Path, mixed_recipe: Recipe, ctrl_c_after: Any

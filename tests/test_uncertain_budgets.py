@@ -153,7 +153,7 @@ def test_budgets_of_expected_amounts_that_cannot_be_meant_are_refused(kept: Any)
         MPC(min_service=DEMAND, prices=kept.prices).start(MultiAgentVectorEnv(kept.network, num_envs=1), 0)
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_proofs_of_other_budgets_are_other_jobs(tmp_path: Any) -> None:
     """Those on disk are of one question; a budget that binds nobody changes nothing."""
     loose, free = (small_bound(budget, directory=tmp_path) for budget in ({"emissions": 1e3}, None))
