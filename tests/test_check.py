@@ -96,9 +96,12 @@ def test_check_takes_names_and_recipes(monkeypatch: pytest.MonkeyPatch, capsys: 
     """Whatever there is can be checked, by its name or as a file; mistakes of recipes are named too."""
     recipe = (folder("agents") / "independent_ppo.toml").read_text()
     Path("mine.toml").write_text(recipe)
-    assert run(monkeypatch, "check", "copper_net", "independent_ppo", "mine.toml") == 0
+    told = "--material tin --mass kt --in-use 900 --lifetime 25 --recycled 0.2".split()
+    assert run(monkeypatch, "new", "tin.toml", *told) == 0
+    assert run(monkeypatch, "check", "copper_net", "independent_ppo", "mine.toml", "tin.toml") == 0
     said = capsys.readouterr().out
-    assert said.count("no mistakes") == 3
+    assert said.count("no mistakes") == 4
+    assert "tin.toml: 11 compartments, 1 agent, scenarios" in said
     assert "mine.toml: recipe of PPO, 600,000 steps in 32 copies" in said
     Path("mine.toml").write_text(recipe.replace('algorithm = "PPO"', 'algorithm = "PPQ"'))
     assert run(monkeypatch, "check", "mine.toml") == 2

@@ -242,8 +242,9 @@ def _check_network(source: str, progress: Callable[[float], None], place: int, c
             raise CirlError(f"{source}, scenario '{variant.scenario_name}': {error}") from error
         remarks += (f"scenario '{variant.scenario_name}': {remark}" for remark in lint_warnings(variant, env))
         progress((place + i / (1 + len(network.scenarios))) / count)
+    agents = f"{len(network.agents)} agent{'' if len(network.agents) == 1 else 's'}"
     common.say(
-        f"{source}: {len(network.compartments)} compartments, {len(network.agents)} agents, "
+        f"{source}: {len(network.compartments)} compartments, {agents}, "
         f"scenarios {', '.join([network.scenario_name, *network.scenarios])}: no mistakes"
     )
     for remark in remarks:
