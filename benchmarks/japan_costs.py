@@ -73,7 +73,7 @@ def abatement(name: str) -> Iterator[str]:
         run = _played(bound(network, aim="emissions", min_service=1, agents=[agent]))
         avoided = float(usual.accounts[0, EMISSIONS] - run.accounts[0, EMISSIONS])
         cost = float(run.accounts[0, COST] - usual.accounts[0, COST])
-        low, high = cost_range(ranges, run.flow.sum(axis=0) - usual.flow.sum(axis=0))
+        low, high = amount_range(ranges, run.flow.sum(axis=0) - usual.flow.sum(axis=0))
         ends = [(cost + change) / avoided for change in (low, high)]
         if agent in BOOKED:
             cells = f"{cost / avoided:.0f}, {ends[0]:.0f} to {ends[1]:.0f} |"
@@ -82,18 +82,21 @@ def abatement(name: str) -> Iterator[str]:
         yield f"| {network.compartments[agent].label} | {avoided:.0f} | {cells} |"
 
 
-def cost_range(network: Network, mass: Floats) -> tuple[float, float]:
-    """Return by how much the cost of a change of flows differs at most as rates are uncertain, lowest and highest.
+def amount_range(network: Network, mass: Floats, account: str = "cost") -> tuple[float, float]:
+    """Return by how much what is booked differs at most as rates are uncertain, lowest and highest.
 
     Args:
-        network: one with uncertain rates of the account of costs.
-        mass: what flows more along each arc, in an episode, shape (arcs,), mass.
+        network: one with uncertain rates of the account.
+        mass: what flows, or flows more, along each arc, in an episode, shape (arcs,), mass.
+        account: its id.
     """
     low = high = 0.0
     for path, spread in network.uncertain.items():
-        if path.endswith(".accounts.cost"):
-            arc = network.arc_index[path.split(".")[1]]
-            booked = dict(network.arcs[arc].accounts)["cost"] * mass[arc]
+        if path.endswith(f".accounts.{account}"):
+            id_ = path.split(".")[1]
+            is_node = path.startswith("nodes.")
+            charged = network.recipients == network.node_index[id_] if is_node else network.arc_index[id_]
+            booked = dict(network.compartments[id_].accounts)[account] * np.sum(mass[charged])
             ends = [booked * (end - 1.0) for end in spread.ends]
             low, high = low + min(ends), high + max(ends)
     return low, high

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Annotated
 
 from benchmarks.document import markdown_table, write_sections
+from benchmarks.japan_costs import amount_range
 from benchmarks.steel import DOCUMENT
-from cirl_marl import CirlError, MultiAgentVectorEnv, simulate
+from cirl_marl import CirlError, MultiAgentVectorEnv, load_network, simulate
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.errors import unknown_name
@@ -94,6 +95,7 @@ CAST = ("*bof_steel", "*eaf_steel")
 AMOUNTS = (
     Amount("steel_world", "emissions", "t CO2e/t cast", 1.91, "worldsteel, 2022, a tonne of steel", CAST),
     Amount("steel_world", "energy", "GJ/t cast", 20.99, "worldsteel, 2022, likewise", CAST),
+    Amount("steel_japan", "emissions", "Mt CO2e", 159.5, "JISF, fiscal 2023: 153 Mt of 96 % of the industry"),
     Amount("aluminium_world", "emissions", "Mt CO2e", 1110.0, "IAI, with rolling"),
     Amount("aluminium_world", "energy", "PJ", 4356.0, "IAI: smelters 2021, refineries 2024"),
     Amount("copper_world", "emissions", "Mt CO2e", 97.0, "ICA, refined copper, 2018"),
@@ -101,22 +103,29 @@ AMOUNTS = (
 )
 
 
-def first_year(amount: Amount) -> float:
-    """Return what the model has of an account in its first year, as it is published."""
+def first_year(amount: Amount) -> tuple[float, float, float]:
+    """Return what the model has of an account in its first year, as it is published, and at the ends of its factors."""
     env = MultiAgentVectorEnv(amount.network, num_envs=1, horizon=1)
     run, accounts = rollout(env, Neutral()), [account.id for account in env.network.accounts]
     total = float(run.bookings[0, accounts.index(amount.account), 0])
+    low = high = 0.0
+    if "factor_ranges" in load_network(amount.network).scenarios:
+        uncertain = load_network(amount.network, scenario="factor_ranges")
+        low, high = amount_range(uncertain, run.flow[0] * env.network.episode.control_interval, amount.account)
     names = [arc.id for arc in env.network.arcs]
     chosen = {name for pattern in amount.arcs for name in fnmatch.filter(names, pattern)}
-    return 1e3 * total / float(run.flow[0, [name in chosen for name in names]].sum()) if chosen else total
+    scale = 1e3 / float(run.flow[0, [name in chosen for name in names]].sum()) if chosen else 1.0
+    return total * scale, (total + low) * scale, (total + high) * scale
 
 
 def amounts() -> Iterator[tuple[str, ...]]:
     """Yield the rows of the table of accounts."""
     for amount in AMOUNTS:
-        here = first_year(amount)
+        here, low, high = first_year(amount)
         digits = 2 if amount.arcs else 0
-        numbers = (f"{here:.{digits}f} {amount.unit}", f"{amount.value:.{digits}f}", f"{here / amount.value - 1:+.0%}")
+        ends = f", {low:.{digits}f} to {high:.{digits}f}" if low < high else ""
+        off = f"{here / amount.value - 1:+.0%}"
+        numbers = (f"{here:.{digits}f} {amount.unit}{ends}", f"{amount.value:.{digits}f}", off)
         yield f"`{amount.network}`", amount.account, *numbers, amount.source
 
 

@@ -19,7 +19,7 @@ from small_networks import ACCOUNTS, booked, city, plain_networks, small, with_l
 from test_optimum import bounded, certifiable, pinned
 from typer.testing import CliRunner
 
-from benchmarks.japan_costs import cost_range
+from benchmarks.japan_costs import amount_range
 from benchmarks.published import AMOUNTS, Amount, first_year
 from cirl_marl import (
     MPC,
@@ -495,8 +495,15 @@ def test_pictures_show_who_books_what_and_the_total(tmp_path: Path, monkeypatch:
 
 @pytest.mark.parametrize("amount", AMOUNTS, ids=lambda amount: f"{amount.network} {amount.account}")
 def test_amounts_of_the_first_year_are_near_those_reported(amount: Amount) -> None:
-    """Within 11 %: what is published is of other years, of steel for iron in it, or with rolling."""
-    assert first_year(amount) == pytest.approx(amount.value, rel=0.11)
+    """Within 11 %: what is published is of other years, of steel for iron in it, or with rolling.
+
+    Where sources of factors disagree by more, it is as well between what comes of their ends.
+    """
+    here, low, high = first_year(amount)
+    assert here == pytest.approx(amount.value, rel=0.11)
+    assert low <= here <= high
+    if here - low > 0.11 * here:
+        assert low < amount.value < high
 
 
 def test_recycling_needs_the_published_part_of_making_anew() -> None:
@@ -549,7 +556,7 @@ def test_ranges_of_factors_leave_all_other_draws_alone() -> None:
         )
         for ends in product(*(scenario.uncertain[path].ends for path in costs))
     ]
-    assert cost_range(scenario, mass) == pytest.approx((min(corners), max(corners)))
+    assert amount_range(scenario, mass) == pytest.approx((min(corners), max(corners)))
 
 
 def test_copies_and_intervals_keep_what_is_booked() -> None:
