@@ -488,3 +488,21 @@ def test_a_service_that_is_made_up_for_is_not_weighed() -> None:
     assert bound(network, min_service=0.0).levels[0] < 0.5
     with pytest.raises(CirlError, match="takes no more than the best there is of driving"):
         account_front(network, ("circularity", "driving"), points=3)
+
+
+@pytest.mark.slow
+def test_circular_copper_costs_more_where_metal_is_cheap_and_scrap_dear() -> None:
+    """At these ends of factors plans dominate 99 % of what is proved; as stated there is nothing to weigh."""
+    stated = load_network("copper_world").with_options(episode={"horizon": 8})
+    spreads = load_network("copper_world", scenario="factor_ranges").uncertain
+    arcs = []
+    for arc in stated.arcs:
+        rates: dict[str, Any] = dict(arc.accounts)
+        if (path := f"arcs.{arc.id}.accounts.cost") in spreads:
+            rates["cost"] *= spreads[path].ends[0 if arc.id == "mining" else 1]
+        arcs.append(replace(arc, accounts=rates))
+    front = account_front(replace(stated, arcs=tuple(arcs)), ("circularity", "cost"), min_service=1.0, points=3)
+    proved, achieved = front.volumes
+    assert 0.99 * proved <= achieved <= proved * (1 + 1e-5) and front.prices[0] > 0
+    with pytest.raises(CirlError, match="nothing to weigh"):
+        account_front(stated, ("circularity", "cost"), min_service=1.0)

@@ -559,6 +559,15 @@ def test_ranges_of_factors_leave_all_other_draws_alone() -> None:
     assert amount_range(scenario, mass) == pytest.approx((min(corners), max(corners)))
 
 
+def test_ranges_of_a_node_are_of_what_enters_it() -> None:
+    """Two tonnes that are recycled may cost from 530 to 1 105 USD each, where 815 are booked."""
+    scenario = load_network("plastics_world", scenario="factor_ranges")
+    mass = np.zeros(len(scenario.arcs))
+    mass[scenario.arc_index["packaging_collected"]] = 2.0
+    assert amount_range(scenario, mass) == pytest.approx((2 * (0.530 - 0.815), 2 * (1.105 - 0.815)))
+    assert amount_range(scenario, mass, "emissions") == (0.0, 0.0)
+
+
 def test_copies_and_intervals_keep_what_is_booked() -> None:
     """Regions share accounts, each compartment of a copy its rates; a network of other intervals has their rates."""
     world = load_network("steel_world")
