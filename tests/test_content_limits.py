@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import expm
 from test_changing_contents import NOISE, mine
 from test_substances import sorter, sorting_line, substances_networks
 
@@ -21,11 +22,13 @@ from cirl_marl import (
     Control,
     ControlKind,
     DefinitionError,
+    Episode,
     Law,
     MultiAgentVectorEnv,
     Network,
     NetworkError,
     Node,
+    Role,
     Service,
     Substance,
     bound,
@@ -149,15 +152,91 @@ def test_what_there_is_dilutes_and_an_empty_stock_does_not() -> None:
 
 
 def test_a_loop_that_separates_again_and_again_keeps_every_limit() -> None:
-    """What comes back is sorted anew; none of it comes back pure where nothing is separated."""
+    """What comes back is sorted anew, and gets as pure as one likes; not where nothing is separated.
+
+    Of a component of which a part p is rejected, use and what is recovered obey ẋ = −k·x + y, ẏ = (1 − p)·k·x − y.
+    """
     network = sorting_line(transfer=0.8)
     again = Arc(id="again", donor="recovered", recipient="use", law=Law.DONOR, rate=1.0)
     arcs = (network.arcs[0], replace(network.arcs[1], recipient="recovered"), network.arcs[2], again)
     nodes = (*network.nodes, Node(id="recovered", initial=(0.0, 0.0)))
-    assert with_limit(network, 1e-6, nodes=nodes, arcs=arcs)
+    looped = with_limit(network, 1e-6, nodes=nodes, arcs=arcs).with_options(episode={"horizon": 40})
+    run = MultiAgentVectorEnv(looped, num_envs=1)
+    run.reset(seed=0)
+    for _ in range(40):
+        outcome = run.advance(np.empty((0, 1)))
+    assert outcome.levels[0, 0] == 1.0
+    rate, ends = np.log(2), []
+    for start, part in ((98.0, 0.1), (2.0, 0.8)):
+        ends.append(expm(40 * np.array([[-rate, 1.0], [(1 - part) * rate, -1.0]]))[:, 0] * start)
+    rows, stock = [looped.node_index[id_] for id_ in ("use", "recovered")], run.physical.stock
+    np.testing.assert_allclose(run.rows.stocks(stock)[rows, 0], sum(ends), rtol=1e-10)
+    np.testing.assert_allclose(run.rows.substances(stock)[rows, 0], ends[1], rtol=1e-10)
     plain = tuple(replace(arc, transfer={}) for arc in arcs)
     with pytest.raises(NetworkError, match=r"the lowest limit that can be kept is 0.02$"):
         with_limit(network, 1e-6, nodes=nodes, arcs=plain)
+
+
+def sorting_loop(seed: int, mines: int, *, controlled: bool = False) -> Network:
+    """Return mines of different contents, and sorters without stock that pass material round and on to use."""
+    rng, count = np.random.default_rng(seed), int(np.random.default_rng(seed).integers(1, 4))
+    nodes = [Node(id=f"sorter_{i}", stores=False) for i in range(count)]
+    nodes += [Node(id="use", initial=(0.0, 0.0)), Node(id="waste", initial=(0.0, 0.0), role=Role.LANDFILL)]
+    arcs = []
+    for i in range(mines):
+        start, share = float(rng.uniform(1, 9)), float(rng.uniform(0.01, 0.3))
+        nodes.append(Node(id=f"mine_{i}", initial=(start, start), content={"copper": share}))
+        entry = f"sorter_{rng.integers(count)}"
+        arcs.append(Arc(id=f"mined_{i}", donor=f"mine_{i}", recipient=entry, rate=float(rng.uniform(0.1, 0.5))))
+    for i in range(count):
+        shares, parts = rng.dirichlet(np.ones(count + 2), 2).tolist()
+        ends = {f"on_{i}_{j}": f"sorter_{j}" for j in range(count) if i != j} | {f"rejects_{i}": "waste"}
+        for (id_, end), share, part in zip(ends.items(), shares, parts, strict=False):
+            arc = Arc(id=id_, donor=f"sorter_{i}", recipient=end, law=Law.SHARE, share=share, transfer={"copper": part})
+            if controlled and id_ == "rejects_0":
+                control = Control(kind=ControlKind.TRANSFER, low=0.0, neutral=part, high=part, substances=("copper",))
+                arc = replace(arc, transfer={}, control=control)
+            arcs.append(arc)
+        arcs.append(Arc(id=f"made_{i}", donor=f"sorter_{i}", recipient="use", law=Law.SHARE))
+    episode = Episode(horizon=3)
+    return Network(
+        name="loop", nodes=tuple(nodes), arcs=tuple(arcs), substances=(Substance(id="copper"),), episode=episode
+    )
+
+
+@given(seed=st.integers(0, 2**31), mines=st.integers(1, 3), controlled=st.booleans())
+@settings(max_examples=40)
+def test_loops_without_stock_purify_as_far_as_they_do(seed: int, mines: int, controlled: bool) -> None:
+    """Contents of all flows lie in their ranges; of one mine they are these, and limits below them are refused."""
+    network, rng = sorting_loop(seed, mines, controlled=controlled), np.random.default_rng(seed)
+    starts = content_limits._starts(network, {})
+    low, high = (side[1] for side in reachable_contents(network, starts, content_limits._shares(network))[1])
+    env = MultiAgentVectorEnv(network, num_envs=1)
+    env.reset(seed=0)
+    for _ in range(network.episode.horizon):
+        env.advance(rng.choice([-1.0, 0.0, 1.0], (len(env.actuators.control_rows), 1)))
+        content = env.physical.substances[:, 0] / env.physical.flow[:, 0]
+        assert (content >= low - 1e-8).all() and (content <= high + 1e-8).all()
+    if mines > 1:  # of one content, which mixing alone does not change, not even by rounding
+        nodes = [replace(node, content=dict.fromkeys(dict(node.content), 0.1)) for node in network.nodes]
+        arcs = [replace(arc, transfer={}, control=None) for arc in network.arcs]
+        mixing = replace(network, nodes=tuple(nodes), arcs=tuple(arcs))
+        starts, shares = content_limits._starts(mixing, {}), content_limits._shares(mixing)
+        assert (reachable_contents(mixing, starts, shares)[1][:, 1] == 0.1).all()
+    if mines > 1 or controlled:
+        return
+    np.testing.assert_allclose(low, content, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(high, content, rtol=0, atol=1e-8)
+    made = network.arc_index["made_0"]
+    limits = [
+        Service(id="pure", provider="made_0", quantity="flow", substance="copper", low=0.0, high=content[made] * part)
+        for part in (1.001, 0.999)
+    ]
+    assert replace(network, services=(limits[0],))
+    with pytest.raises(NetworkError, match="of what is in 'made_0' is copper, whatever is done"):
+        replace(network, services=(limits[1],))
+    drawn = {"arcs.rejects_0.transfer.copper": Spread(low=0.5, high=1.0, distribution="uniform")}
+    assert replace(network, services=(limits[1],), uncertain=drawn)
 
 
 def test_limits_and_contents_that_change_are_those_of_some_time() -> None:

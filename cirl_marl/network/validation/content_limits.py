@@ -14,7 +14,7 @@ from cirl_marl.network.reachable_contents import reachable_contents
 from cirl_marl.network.rowsum import Floats
 from cirl_marl.network.series import means
 from cirl_marl.network.split_fractions import share_ranges, splits
-from cirl_marl.network.substances import CONTENT, network_of_substance, separates
+from cirl_marl.network.substances import CONTENT, network_of_substance
 from cirl_marl.network.uncertainty import CERTAIN, factor_ranges
 
 ROUND_OFF = 1e-9
@@ -73,7 +73,7 @@ def _starts(network: Any, factors: Mapping[str, tuple[float, float]]) -> Floats:
 
 
 def _shares(network: Any) -> Floats:
-    """Return the least and greatest share of each arc where nodes separate, else 1, shape (2, components, arcs).
+    """Return the least and greatest share of each arc of law ``share``, 1 of others, shape (2, components, arcs).
 
     Of what leaves a node of which some share is not certain they may be any.
     """
@@ -82,12 +82,11 @@ def _shares(network: Any) -> Floats:
     divisions = [network.splits, *(splits(network_of_substance(network, part.id)) for part in network.substances)]
     for row, division in enumerate(divisions):
         for split in division:
-            if separates(network, split):
-                arcs = [*split.controlled_arcs, *split.other_arcs]
-                least, most = share_ranges(split, split.bounds[[0, 2]])
-                is_certain = uncertain.isdisjoint(network.arcs[k].id for k in arcs)
-                shares[0, row, arcs] = least.min(axis=1) if is_certain else 0.0
-                shares[1, row, arcs] = most.max(axis=1) if is_certain else 1.0
+            arcs = [*split.controlled_arcs, *split.other_arcs]
+            least, most = share_ranges(split, split.bounds[[0, 2]])
+            is_certain = uncertain.isdisjoint(network.arcs[k].id for k in arcs)
+            shares[0, row, arcs] = least.min(axis=1) if is_certain else 0.0
+            shares[1, row, arcs] = most.max(axis=1) if is_certain else 1.0
     return shares
 
 
