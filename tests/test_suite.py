@@ -20,13 +20,14 @@ from some import some
 
 import cirl_marl
 from benchmarks.suite import prove
-from cirl_marl import CirlError, Neutral, RunError, Trained, load_task, tasks
+from cirl_marl import CirlError, Network, Neutral, RunError, Trained, load_task, tasks
 from cirl_marl.controllers.rollout import first_seed, rollout, starting_stocks
 from cirl_marl.definitions.ids import ids
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.jobs import run_jobs
 from cirl_marl.learners import interface
 from cirl_marl.learners.acting_weights import acting_weights, rebuild_run
+from cirl_marl.learners.recipe import Recipe
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.certificate import Certificate
 from cirl_marl.optimum.options import DEGREE
@@ -66,9 +67,22 @@ def test_there_are_enough_tasks() -> None:
     assert all(task.id in ids().values() for task in suite)
     assert len(algorithms()) == len(suite[0].seeds) == 10
     for name in algorithms():
-        recipe = load_algorithm(name).recipe_of()
-        recipe.check(10_000)
-        assert recipe.run.min_service == suite[0].min_service
+        load_algorithm(name).recipe_of(suite[0]).check(10_000)
+
+
+def test_learners_train_for_what_their_task_demands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a training gets asks for the service of its task, of which some demand more than others."""
+    suite = [load_task(name) for name in tasks()]
+    assert len({task.min_service for task in suite}) > 1
+
+    def stop(directory: Path, network: Network, recipe: Recipe, **settings: Any) -> None:
+        raise RunError(f"{recipe.name} asks for {recipe.run.min_service}")
+
+    monkeypatch.setattr(interface, "complete_run", stop)
+    for task, name in zip(suite, algorithms(), strict=True):
+        job = row_jobs.ResultJob(row=ResultRow(task=task.name, algorithm=name, seed=401, episodes=2), out=tmp_path)
+        with pytest.raises(RunError, match=f"^{name} asks for {task.min_service}$"):
+            job.run(lambda *progress: None)
 
 
 @pytest.mark.parametrize("name", tasks())

@@ -111,7 +111,7 @@ class ResultJob:
         run = complete_run(
             self.run_directory,
             task.network(),
-            algorithm.recipe_of(),
+            algorithm.recipe_of(task),
             steps=steps,
             seed=row.seed,
             report=lambda now: tell("training", steps - now.total + now.env_steps, steps),

@@ -145,9 +145,10 @@ class SuiteAlgorithm:
     share: Annotated[float, "of the steps of a task that it takes"] = 1.0
     changes: Annotated[Mapping[str, Any], "tables of the recipe, laid over it; parameters of another algorithm whole"]
 
-    def recipe_of(self) -> Recipe:
-        """Return the whole recipe."""
+    def recipe_of(self, task: BenchmarkTask) -> Recipe:
+        """Return the whole recipe, which asks for the service that the task demands."""
         plain = load_recipe(self.recipe).model_dump(mode="json")
+        plain["run"]["min_service"] = task.min_service
         changes = dict(self.changes)
         if "algorithm" in changes.get("learner", {}) or "scheme" in changes.get("learner", {}):
             plain["learner"]["parameters"] = {}
