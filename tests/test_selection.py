@@ -24,6 +24,7 @@ from cirl_marl.learners.interface import Trained, resume, train
 from cirl_marl.learners.policies import Policies, Policy
 from cirl_marl.learners.recipe import LearnerSettings, Recipe, Run
 from cirl_marl.learners.run_directory import RunDirectory
+from cirl_marl.learners.stacked import gradient_ascent
 from cirl_marl.learners.validation import FIRST_SEED, LARGEST_MULTIPLIER, Multipliers, Score, validation_score
 
 HORIZON, STEPS = 6, 96
@@ -57,13 +58,21 @@ def numbers(policy: Policy) -> np.ndarray:
     return np.concatenate([*weights, moments.mean, moments.var])
 
 
-@pytest.mark.parametrize(("first", "share"), [(0.995, 0.5625), (0.985, 0.0)])
-def test_policies_between_serve_just_enough(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, first: float, share: float
+@pytest.mark.parametrize(
+    ("first", "mean", "rest"),
+    [
+        (0.995, 0.98, [0.995, 0.985, 0.985, 0.991, 0.995, 0.985, 0.985, 0.991]),
+        (0.985, 0.995, [0.985, 0.995, 0.985, 0.985]),
+        (0.985, 0.98, []),
+    ],
+    ids=["the first serves", "the mean serves", "nothing serves"],
+)
+def test_policies_near_the_last_serve_just_enough(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, first: float, mean: float, rest: list[float]
 ) -> None:
-    """Of two evaluations the first serves and the last does not: what acts is between, if the first serves at all."""
+    """Of two evaluations the last does not serve: their mean acts if it does, or what is between who serves and it."""
     seen: list[np.ndarray] = []
-    assured = [first, 0.98, 0.995, 0.985, 0.985, 0.991]
+    assured = [first, 0.98, mean, *rest]
 
     def score(env: MultiAgentVectorEnv, policies: Policies, aims: object) -> Score:
         seen.append(numbers(policies.policies["mine"]))
@@ -73,13 +82,27 @@ def test_policies_between_serve_just_enough(
     monkeypatch.setattr(trainer, "StackedPolicies", lambda all_, _: Policies({k: v.policy for k, v in all_.items()}))
     climb = recipe(engine="gradients", min_service=0.99, steps=24, evaluations=2)
     options: dict[str, Any] = {"horizon": HORIZON, "circularity": "mean"}
-    last = numbers(train("copper_net", climb, directory=tmp_path / "run", **options).learners["mine"].policy)
-    start, *between = seen[0], *seen[2:]
-    shares = [0.5, 0.75, 0.625, 0.5625] if share else []
-    for numbers_there, expected in zip(between, shares, strict=True):
-        np.testing.assert_allclose(numbers_there, (1 - expected) * start + expected * last, atol=1e-6)
-    acting = numbers(Trained(tmp_path / "run").policies["mine"])
-    np.testing.assert_allclose(acting, (1 - share) * start + share * last, atol=1e-6)
+    before = numbers(train("copper_net", climb, steps=12, **options).learners["mine"].policy)  # its last update
+    seen.clear()
+    training = train("copper_net", climb, directory=tmp_path / "run", **options)
+    last, policy = numbers(training.learners["mine"].policy), training.learners["mine"].policy
+    assert policy.normaliser is not None
+    weights = len(last) - 2 * len(observation_statistics(policy.normaliser)["observation"].mean)
+    # each is evaluated and expected; moments have no mean of their own
+    expected = [seen[0], last, before + gradient_ascent.MEAN_SHARE * (last - before)]
+    expected[2][weights:] = last[weights:]
+    acting = expected[0] if first > 0.99 else expected[2]
+    for place in range(0, len(rest), 4):
+        origin, end, low, high = acting, last if place == 0 else expected[2], 0.0, 1.0
+        for level in rest[place : place + 4]:
+            share = (low + high) / 2
+            expected.append((1 - share) * origin + share * end)
+            low, high, acting = (share, high, expected[-1]) if level > 0.99 else (low, share, acting)
+    np.testing.assert_allclose(seen, expected, atol=1e-6)
+    assert not np.allclose(expected[2], last, atol=1e-4)
+    if not rest:
+        acting = expected[0]
+    np.testing.assert_allclose(numbers(Trained(tmp_path / "run").policies["mine"]), acting, atol=1e-6)
     seen.clear()  # a training that is kept nowhere tries nothing, and ends alike
     np.testing.assert_array_equal(numbers(train("copper_net", climb, **options).learners["mine"].policy), last)
     assert len(seen) == 2

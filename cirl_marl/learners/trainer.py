@@ -31,7 +31,7 @@ from cirl_marl.learners.stacked.conditions import gradient_obstacle, gradient_st
 from cirl_marl.learners.stacked.stack import Stack, StackedPolicies
 from cirl_marl.learners.start import begin_again, begin_from
 from cirl_marl.learners.validation import Multipliers, Rank, Score, validation_score
-from cirl_marl.learners.weight_path import WeightPath
+from cirl_marl.learners.weight_path import WeightPath, mean_numbers, numbers_of
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import CIRCULARITY
 from cirl_marl.optimum.aims import aims_of
@@ -265,7 +265,7 @@ class Training:
         self._evaluate()
         self._bring_up_to_date()
         if self.run is not None:
-            self._try_between(self.run)
+            self._try_others(self.run)
             partial_folder = self.run.begin_checkpoint()
             for learner in self.learners.values():
                 learner.write_state(partial_folder, {}, last=True)
@@ -365,24 +365,35 @@ class Training:
         budgets = {budget.name: budget.most for budget in self._aims.budgets}
         return score.rank(self.config.recipe.run.min_service, budgets)
 
-    def _try_between(self, run: RunDirectory) -> None:
-        """Where the last policies of exact gradients lack what those that act serve, let the best between them act."""
-        env, best, last = self._validation_env, self._best, self._last_score
-        if self.config.recipe.run.engine != "gradients" or env is None or best is None or last is None:
+    def _try_others(self, run: RunDirectory) -> None:
+        """Where the last policies of exact gradients lack what is demanded, let the best of others near them act.
+
+        These are the mean of the last ones, and what lies between those that act, if they serve, and either.
+        """
+        env, last, learners = self._validation_env, self._last_score, self.learners
+        if self.config.recipe.run.engine != "gradients" or env is None or last is None or self._rank(last)[0]:
             return
-        if not self._rank(best)[0] or self._rank(last)[0]:
-            return
-        folder = run.acting_checkpoint
-        origins = {name: load_acting_learner(folder, group, env) for name, group in self.groups.items()}
-        between, low, high = WeightPath(self.learners, origins), 0.0, 1.0
-        for _ in range(HALVINGS):
-            share = (low + high) / 2
-            between.set(share)
-            policies = Policies({name: learner.policy for name, learner in self.learners.items()})
-            score = validation_score(env, policies, self._aims)
-            low, high = (share, high) if self._rank(score)[0] else (low, share)
-            self._keep_if_best(score)
-        between.set(1.0)
+        end, mean = numbers_of(learners), mean_numbers(learners)
+        is_served = self._try_share(WeightPath(learners, end, mean), 1.0)
+        for target in (end,) if is_served else (end, mean):
+            if self._best is None or not self._rank(self._best)[0]:
+                break
+            folder = run.acting_checkpoint
+            origins = {name: load_acting_learner(folder, group, env) for name, group in self.groups.items()}
+            path, low, high = WeightPath(learners, numbers_of(origins), target), 0.0, 1.0
+            for _ in range(HALVINGS):
+                share = (low + high) / 2
+                low, high = (share, high) if self._try_share(path, share) else (low, share)
+        WeightPath(learners, end, end).set(1.0)
+
+    def _try_share(self, path: WeightPath, share: float) -> bool:
+        """Validate policies on a path, keep them if they are the best, and return whether they keep all demands."""
+        assert self._validation_env is not None
+        path.set(share)
+        policies = Policies({name: learner.policy for name, learner in self.learners.items()})
+        score = validation_score(self._validation_env, policies, self._aims)
+        self._keep_if_best(score)
+        return self._rank(score)[0]
 
     def _write_policies(self, folder: Path) -> None:
         for learner in self.learners.values():

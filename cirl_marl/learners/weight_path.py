@@ -1,8 +1,9 @@
-"""Policies between two checkpoints of a training, by linear interpolation of weights and moments.
+"""Policies near those of a training, of which some serve where its last do not: means, and what is between two.
 
 Multipliers make services swing about what is demanded, and steps get small before the swings end: the last policies
-often lack a thousandth of a service, and those that serve came much earlier. Both are of one training and near each
-other, so that a mean of their numbers acts between them (Wortsman et al. 2022, Model soups, arXiv 2203.05482).
+often lack a thousandth of a service, and those that serve came much earlier. The mean of the last policies is what
+they swing about. All are of one training and near each other, so that means of their numbers act between them (Wortsman
+et al. 2022, Model soups, arXiv 2203.05482).
 """
 
 from __future__ import annotations
@@ -12,20 +13,23 @@ from typing import Any
 
 from cirl_marl.learners.checkpoint import observation_statistics
 from cirl_marl.learners.learner import Learner
+from cirl_marl.learners.stacked.perceptrons import MEAN, networks_of
+
+Numbers = Mapping[str, Mapping[Any, Any]]
+"""Weights of policies and moments of what they observe, by learner."""
 
 
 class WeightPath:
-    """Learners whose policies move between those of their origins, at 0, and their own, at 1."""
+    """Learners whose policies move between two sets of numbers."""
 
-    def __init__(self, learners: Mapping[str, Learner], origins: Mapping[str, Learner]) -> None:
-        """Begin where the ``learners`` are; ``origins`` have the same names and shapes, and are not needed later."""
-        self._learners = learners
-        self._ends = {name: (_numbers(origins[name]), _numbers(learner)) for name, learner in learners.items()}
+    def __init__(self, learners: Mapping[str, Learner], origins: Numbers, ends: Numbers) -> None:
+        """Take the numbers at 0 and at 1; the ``learners`` stay as they are."""
+        self._learners, self._origins, self._ends = learners, origins, ends
 
     def set(self, share: float) -> None:
-        """Give the learners a ``share`` of their own numbers and the rest of their origins'; 1 is exact."""
+        """Give the learners a ``share`` of the numbers at the end and the rest of their origins'; 1 is exact."""
         for name, learner in self._learners.items():
-            origin, end = self._ends[name]
+            origin, end = self._origins[name], self._ends[name]
             numbers = {key: (1.0 - share) * origin[key] + share * value for key, value in end.items()}
             state = learner.model.policy.state_dict()
             learner.model.policy.load_state_dict({key: numbers[key] for key in state})
@@ -33,10 +37,24 @@ class WeightPath:
                 setattr(part, key[-1], numbers[key])
 
 
-def _numbers(learner: Learner) -> dict[Any, Any]:
-    """Return copies of the weights of a policy and of the moments of what it observes."""
-    weights = {key: value.clone() for key, value in learner.model.policy.state_dict().items()}
-    return weights | {key: getattr(part, key[-1]).copy() for key, part in _moments(learner)}
+def numbers_of(learners: Mapping[str, Learner]) -> Numbers:
+    """Return copies of the numbers of learners."""
+    return {
+        name: {key: value.clone() for key, value in learner.model.policy.state_dict().items()}
+        | {key: getattr(part, key[-1]).copy() for key, part in _moments(learner)}
+        for name, learner in learners.items()
+    }
+
+
+def mean_numbers(learners: Mapping[str, Learner]) -> Numbers:
+    """Return the numbers of learners with the running means of the weights that exact gradients move."""
+    numbers = {}
+    for name, last in numbers_of(learners).items():
+        policy = learners[name].model.policy
+        states = networks_of(policy).optimiser.state
+        parts = {key: states.get(weight, {}) for key, weight in policy.named_parameters()}
+        numbers[name] = {**last, **{key: state[MEAN] for key, state in parts.items() if MEAN in state}}
+    return numbers
 
 
 def _moments(learner: Learner) -> Iterator[tuple[tuple[str, str], Any]]:

@@ -45,6 +45,8 @@ MARGIN = 0.05
 """Least margin of a service, in parts of what may lack: where nothing is random its level swings about the demand."""
 LARGEST_NORM = 0.2
 """Norm to which gradients are clipped where the algorithm has no ``max_grad_norm``."""
+MEAN_SHARE = 0.05
+"""Share of an update in the mean of the last policies: swings of prices take some twenty updates."""
 LEAST_PRICE = 1e-4
 """Below which no price falls, per circularity scale."""
 
@@ -137,6 +139,7 @@ class GradientStack(ActorStack):
         update_learning_rate(weights.optimiser, rate)
         weights.clip(getattr(self._models[0], "max_grad_norm", LARGEST_NORM))
         weights.optimiser.step()
+        weights.move_mean(MEAN_SHARE)
         self._updates += 1
         levels = after.service / length
         self._move_prices(levels, self._amounts())
