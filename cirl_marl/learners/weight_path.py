@@ -15,14 +15,14 @@ from cirl_marl.learners.checkpoint import observation_statistics
 from cirl_marl.learners.learner import Learner
 from cirl_marl.learners.stacked.perceptrons import MEAN, networks_of
 
-Numbers = Mapping[str, Mapping[Any, Any]]
+PolicyNumbers = Mapping[str, Mapping[Any, Any]]
 """Weights of policies and moments of what they observe, by learner."""
 
 
 class WeightPath:
     """Learners whose policies move between two sets of numbers."""
 
-    def __init__(self, learners: Mapping[str, Learner], origins: Numbers, ends: Numbers) -> None:
+    def __init__(self, learners: Mapping[str, Learner], origins: PolicyNumbers, ends: PolicyNumbers) -> None:
         """Take the numbers at 0 and at 1; the ``learners`` stay as they are."""
         self._learners, self._origins, self._ends = learners, origins, ends
 
@@ -37,7 +37,7 @@ class WeightPath:
                 setattr(part, key[-1], numbers[key])
 
 
-def numbers_of(learners: Mapping[str, Learner]) -> Numbers:
+def numbers_of(learners: Mapping[str, Learner]) -> PolicyNumbers:
     """Return copies of the numbers of learners."""
     return {
         name: {key: value.clone() for key, value in learner.model.policy.state_dict().items()}
@@ -46,7 +46,7 @@ def numbers_of(learners: Mapping[str, Learner]) -> Numbers:
     }
 
 
-def mean_numbers(learners: Mapping[str, Learner]) -> Numbers:
+def mean_numbers(learners: Mapping[str, Learner]) -> PolicyNumbers:
     """Return the numbers of learners with the running means of the weights that exact gradients move."""
     numbers = {}
     for name, last in numbers_of(learners).items():
