@@ -614,10 +614,11 @@ def test_how_plausible_an_adjustment_is(tmp_path: Path, capsys: pytest.CaptureFi
         words = ["import", str(path), "--out", str(tmp_path / f"again{value}.toml"), "--reconcile"]
         app([*words, "--reservoir", "Ore", "--outside", "Use"], standalone_mode=False)
         said = capsys.readouterr().out
-        assert "with 1 degrees of freedom" in said and "from the adjusted table" in said
+        assert "degrees of freedom 1," in said and "flows adjusted: 2;" in said and "from the adjusted table" in said
         largest = max(abs(change.after - change.before) for change in found.changes)
         assert f"which is up to {largest:.2g} t/year from the original" in said
         assert ("warning: flows contradict each other" in said) is warned
+        assert ("moved by more than two standard deviations: 2, 'Works' to 'Use' by 12.0" in said) is warned
 
 
 def test_p_values_of_true_uncertainties_are_uniform() -> None:

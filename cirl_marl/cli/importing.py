@@ -68,7 +68,7 @@ def import_(
     for name in report.processes.inferred_stores:
         say(f"'{name}' takes more than it gives, so that it became a store; without --store it was not said to be one")
     if report.changes:
-        say(f"{len(report.changes)} flows were adjusted; the largest changes are")
+        say(f"flows adjusted: {len(report.changes)}; the largest changes are")
         for change in sorted(report.changes, key=lambda entry: -abs(entry.after - entry.before))[:CHANGES_SHOWN]:
             say(f"  {change.pair} ({change.place}): {change.before:g} → {change.after:g} {table.unit}")
     if report.reconciliation is not None:
@@ -91,11 +91,11 @@ def import_(
 def _say_plausibility(reconciliation: Reconciliation) -> None:
     """Say how far flows were moved in standard deviations, and warn if the table contradicts itself."""
     far, p_value = reconciliation.far, reconciliation.p_value
-    degrees = f"{reconciliation.degrees} degrees of freedom"
-    say(f"χ² of the adjustment: {reconciliation.chi_square:.4g} with {degrees}, p = {p_value:.2g}")
+    degrees = f"degrees of freedom {reconciliation.degrees}"
+    say(f"χ² of the adjustment: {reconciliation.chi_square:.4g}, {degrees}, p = {p_value:.2g}")
     if far:
         furthest = f"{far[0].pair} by {abs(far[0].in_deviations):.1f}"
-        say(f"{len(far)} flows were moved by more than two standard deviations, {furthest}")
+        say(f"moved by more than two standard deviations: {len(far)}, {furthest}")
     if p_value < IMPLAUSIBLE:
         say("warning: flows contradict each other more than their uncertainties allow; look at those moved furthest")
 
