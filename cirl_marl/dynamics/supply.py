@@ -44,6 +44,8 @@ LEVELS = ((2, 4e-4, 2), (8, 3e-9, 5), (None, 0.0, ROUNDS + 1))
 correction, if that does as well as the last one; and most of these intervals. The last ones are simulated in full."""
 NOTABLE = 1e-6
 """Part of a demand that, if it lacks though it could be had, is told in a warning."""
+ROUND_OFF = 1e-12
+"""Part of the most that a supply may be from its ends and still be at them."""
 CELLS = 80_000
 """Most masses of all copies together that are worked on at once; more do not stay in a cache."""
 NOTICEABLE = 3e-3, 1e-7
@@ -211,7 +213,9 @@ class Supply:
                     estimate = dynamics.estimate(*inputs, terms=terms, flows=self._reads_flows)
                     base[:, copies] = self.quantities(*estimate)
                 shortage = demand - base
-                gap = np.where(np.where(shortage > 0, supply < range_.most, supply > 0), np.abs(shortage), 0.0)
+                end = ROUND_OFF * range_.most
+                has_room = np.where(shortage > 0, supply < range_.most - end, supply > end)
+                gap = np.where(has_room, np.abs(shortage), 0.0)
                 is_wrong = open_ & (gap > CLOSE * demand).any(axis=0)
                 if not is_wrong.any() or (terms is None and correction == rounds - 1):
                     break
