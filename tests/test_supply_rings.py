@@ -23,7 +23,7 @@ from cirl_marl import (
 )
 from cirl_marl.dynamics import supply
 from cirl_marl.dynamics.complementarity import _complementary_pivots, complementary
-from cirl_marl.network import Network
+from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import Lifetime
 
 
@@ -113,6 +113,26 @@ def test_services_that_hang_on_each_other_lack_nothing_that_can_be_had(seed: int
         amount, low, high, level = together[:, idle]
         assert ((amount >= high * (1 - 1e-12)) | (level > 1 - 5e-9)).all()
         assert ((amount <= low * (1 + 1e-12) + 1e-12) | (level < 1 + 5e-9)).all()
+
+
+@pytest.mark.parametrize("side", [0.0, 1.0])
+def test_round_off_at_the_ends_of_supplies_is_nothing(side: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who is within it of nothing, or of the most, is there: no corrections run out, and nothing is told."""
+    network, plain = rings(479001598), supply.complementary
+    traders = [arc.id for arc in network.arcs if arc.control is not None and arc.control.kind is ControlKind.SHARE]
+    env = MultiAgentVectorEnv(network, num_envs=2, agents=traders or ["mine_0"])
+    actions = np.zeros((len(env.agents), 2))
+    env.reset(seed=1)
+    expected = step(env, actions)
+
+    def rounded(slope: Floats, shortage: Floats, now: Floats, most: Floats, interval: float) -> Floats:
+        found, end = plain(slope, shortage, now, most, interval), side * most
+        return np.where(found == end, abs(end - 1e-15 * most), found)
+
+    monkeypatch.setattr(supply, "complementary", rounded)
+    env.reset(seed=1)
+    np.testing.assert_allclose(step(env, actions), expected, rtol=1e-8)
+    assert (expected[0] == expected[1 + int(side)]).any()
 
 
 @given(seed=st.integers(0, 2**31))
