@@ -118,7 +118,7 @@ def test_services_that_hang_on_each_other_lack_nothing_that_can_be_had(seed: int
 @pytest.mark.parametrize("side", [0.0, 1.0])
 def test_round_off_at_the_ends_of_supplies_is_nothing(side: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Who is within it of nothing, or of the most, is there: no corrections run out, and nothing is told."""
-    network, plain = rings(479001598), supply.complementary
+    network = rings(479001598)
     traders = [arc.id for arc in network.arcs if arc.control is not None and arc.control.kind is ControlKind.SHARE]
     env = MultiAgentVectorEnv(network, num_envs=2, agents=traders or ["mine_0"])
     actions = np.zeros((len(env.agents), 2))
@@ -126,7 +126,7 @@ def test_round_off_at_the_ends_of_supplies_is_nothing(side: float, monkeypatch: 
     expected = step(env, actions)
 
     def rounded(slope: Floats, shortage: Floats, now: Floats, most: Floats, interval: float) -> Floats:
-        found, end = plain(slope, shortage, now, most, interval), side * most
+        found, end = complementary(slope, shortage, now, most, interval), side * most
         return np.where(found == end, abs(end - 1e-15 * most), found)
 
     monkeypatch.setattr(supply, "complementary", rounded)
