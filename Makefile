@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
+unexport PYTHONDONTWRITEBYTECODE  # modules are compiled once, not by every process that imports them
 
 .PHONY: demo check test test-all docs notebooks written lint types wheel fast unit every fuzz kill study planner speed peers adapters clean
 

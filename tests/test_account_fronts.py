@@ -304,6 +304,7 @@ def test_idle_supplies_of_good_episodes_share_what_is_asked_for() -> None:
     assert tight.objective < loose.objective
 
 
+@pytest.mark.slow
 def test_points_worse_than_others_are_bounded_without_limits_of_supplies() -> None:
     """Limits are none of episodes worse than where the others are best; and plans are carried out without any."""
     network, levels = two_sources(), np.array([0.999, 0.9])
@@ -449,8 +450,9 @@ def corner() -> Network:
     )
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize("min_service", [0.95, 0.99])
+@pytest.mark.medium
+@pytest.mark.sample(1)
 def test_limits_of_supplies_prove_nothing_of_worse_episodes(min_service: float) -> None:
     """Without recycling and reuse both are cheapest, though no episode of limited supplies can be like that."""
     network, shares = corner(), list[float]()

@@ -80,6 +80,7 @@ def halfway(network: Network) -> float:
     return float(free + least) / 2
 
 
+@pytest.mark.slow
 def test_weights_are_prices_of_budgets() -> None:
     """Who pays the price of a budget per unit has the optimum of who keeps it, but for what the budget is worth."""
     network = city()
@@ -212,6 +213,7 @@ def test_a_plan_is_not_left_for_a_worse_one() -> None:
     assert f"(at least {least.accounts[0]:.6g}): its price would be infinite" in control.note
 
 
+@pytest.mark.slow
 def test_plans_are_compared_by_what_they_exceed() -> None:
     """At the price of a budget; and charges on what is booked are no part of the objective that is left."""
     network = city().with_options(episode={"horizon": 30})
@@ -407,6 +409,7 @@ def test_a_smoother_plan_may_book_what_the_last_one_did() -> None:
     assert smooth._nearer(centre, reference, dynamics, distance, 1e9, 1e-6, margin, restore=False) is not None
 
 
+@pytest.mark.slow
 def test_of_drawn_numbers_nothing_is_said_to_be_out_of_reach() -> None:
     """What a program of their means cannot keep an episode of others may; without draws it is said."""
     network = load_network("copper_world", scenario="factor_ranges").with_options(episode={"horizon": 3})

@@ -128,6 +128,7 @@ def test_an_annuity_on_what_is_held_is_the_investment_less_its_salvage(life: int
 
 
 @pytest.mark.parametrize("available", [1.0, Series(times=(0.0, 12.0, 20.0), values=(1.0, 0.6, 0.9))])
+@pytest.mark.sample(1)
 def test_least_cost_of_two_technologies_is_that_of_a_program_by_hand(available: Series | float) -> None:
     """Built, aged, retired and run as a linear program of two technologies over 30 years has it, to 1e-6."""
     found = bound(power(available=available), aim="cost", min_service=1.0)

@@ -294,7 +294,7 @@ def test_check_names_the_scenario_that_cannot_run(
     assert "bottles.toml, scenario 'crisis': network 'bottles': node 'households'" in capsys.readouterr().err
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_check_remarks_on_batches_that_never_leave_or_never_end(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

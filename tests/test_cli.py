@@ -333,6 +333,7 @@ def short_net_zero(intervals: int) -> None:
     )
 
 
+@pytest.mark.slow
 def test_plan_shows_how_far_the_search_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """The bar of ``cirl plan`` moves while the best plan is searched for, not only while it is carried out."""
     shares: list[float] = []
@@ -369,7 +370,6 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     return fail
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize(
     ("arguments", "solved", "what"),
     [
@@ -387,6 +387,8 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
         (["pareto", "bottles.toml", "--recipe", "quick.toml", "--points", "2", "--out", "new"], 0, "service weight of"),
     ],
 )
+@pytest.mark.medium
+@pytest.mark.sample(3)
 def test_solver_that_fails(
     arguments: list[str],
     solved: int,

@@ -338,6 +338,7 @@ class TestEveryModel:
             for name, value in alone.items():
                 np.testing.assert_array_equal(value, together[name][..., column], err_msg=name)
 
+    @pytest.mark.sample(5)
     def test_agrees_with_scipy(self, model: ContinuousModel) -> None:
         """Runge-Kutta at a fine step and scipy's DOP853 at 1e-11 agree."""
         state, inputs, context = sample(model, 3)

@@ -325,6 +325,7 @@ def test_a_plan_from_an_empty_stock_is_simulated() -> None:
 
 
 @pytest.mark.parametrize("horizon", [pytest.param(None, marks=pytest.mark.slow), 1])
+@pytest.mark.slow
 def test_mpc_tells_what_is_out_of_reach(horizon: int | None) -> None:
     """Ore is too scarce to dilute so many products, which no single content tells."""
     network = sorter(low=0.0, high=0.01)

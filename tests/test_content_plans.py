@@ -61,6 +61,7 @@ from cirl_marl.reasons.prices import shadow_prices
 
 
 @given(network=substances_networks, seed=st.integers(0, 1000))
+@pytest.mark.slow
 def test_no_episode_is_above_the_bound(network: Network, seed: int) -> None:
     """Whatever agents do, and whatever is separated, λ̄ stays below the bound of the whole."""
     limit = bound(network).objective
@@ -307,6 +308,7 @@ def booked() -> Network:
         ({"aim": "ore", "at_most": {"scrap": 12.0}}, 24.0, 12.0),
     ],
 )
+@pytest.mark.sample(2)
 def test_mpc_keeps_budgets_and_aims_beside_contents(options: dict[str, Any], ore: float, scrap: float) -> None:
     """Of 6 t a year half may be scrap by its copper, less where it is dear or there is little of it."""
     run = controlled_by_mpc(booked(), demanded=1.0, **options)
@@ -316,8 +318,9 @@ def test_mpc_keeps_budgets_and_aims_beside_contents(options: dict[str, Any], ore
     assert yearly.max() <= 2.5 + 1e-3 or "scrap/year" not in options.get("at_most", {})
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize(("seed", "horizon"), [(16, None), (104, None), (4, 2)])
+@pytest.mark.medium
+@pytest.mark.sample(1)
 def test_mpc_delivers_what_some_actions_deliver(seed: int, horizon: int | None) -> None:
     """Whatever products of ore and scrap cost: of each service as much as constant actions that are drawn."""
     network, rng = mill(seed), np.random.default_rng(seed)
@@ -329,8 +332,8 @@ def test_mpc_delivers_what_some_actions_deliver(seed: int, horizon: int | None) 
     assert controlled.accounts[0, 0] <= run.accounts[0, 0]
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.slow
 def test_mpc_delivers_contents_whose_prices_the_bound_does_not_know(seed: int) -> None:
     """As much as constant actions do, though prices have to rise a hundredfold, one after the other."""
     network = with_substances(random_network(1806943563, 3, 7), 1377318852)
@@ -363,6 +366,7 @@ def test_windows_weigh_accounts_as_the_simulator_does() -> None:
 
 
 @pytest.mark.parametrize("horizon", [2, None])
+@pytest.mark.sample(1)
 def test_mpc_takes_as_much_scrap_as_the_limit_allows(horizon: int | None) -> None:
     """Of ore without copper and scrap with 4 % half may be scrap where 2 % are allowed, three quarters of 3 %."""
     for limit, part in ((0.02, 0.5), (0.03, 0.75)):
@@ -382,6 +386,7 @@ def test_mpc_follows_a_plan_that_sorts() -> None:
 
 
 @pytest.mark.parametrize("horizon", [2, None])
+@pytest.mark.sample(1)
 def test_mpc_keeps_least_contents_and_those_of_stocks(horizon: int | None) -> None:
     """A product that must have copper takes scrap for it; what is in use counts by its stock."""
     run = controlled_by_mpc(sorter(low=0.03), horizon, 1.0)
@@ -496,6 +501,7 @@ def blending(low: float, high: float = np.inf) -> Network:
     ("low", "high", "costs", "rich"),
     [(0.06, np.inf, (1.0, 0.5), 5.0), (0.06, 0.07, (1.0, 0.5), 5.0), (0.0, 0.05, (-1.0, 2.0), 3.75)],
 )
+@pytest.mark.sample(1)
 def test_plans_keep_grades(low: float, high: float, costs: tuple[float, float], rich: float) -> None:
     """Of 10 t with at least 6 % copper half is of 10 %, if that is dear; of at most 5 %, if it is cheap, 3.75 t."""
     network = blending(low, high)

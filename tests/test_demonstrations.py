@@ -80,9 +80,10 @@ def shown_by(controller: Controller, seed: int, view_of: Any, steps: int) -> Ite
         yield before, after, joined, view.score(rewards), done
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize("controller", ["random", "mpc"])
 @pytest.mark.parametrize("scheme", ["independent", "shared", "joint"])
+@pytest.mark.medium
+@pytest.mark.sample(2)
 def test_buffer_holds_what_the_controller_did(scheme: str, controller: str) -> None:
     """In its own units, with the true last observation, whoever the learner acts for; all follow one controller."""
     shown = {"controller": controller, "steps": 20}
@@ -144,6 +145,7 @@ ROLLOUTS: dict[str, Any] = {"n_steps": 8, "batch_size": 8, "n_epochs": 1, "polic
         ("ARS", "MlpPolicy", {"n_delta": 1, "zero_policy": False, "policy_kwargs": {"net_arch": [32]}}),
     ],
 )
+@pytest.mark.sample(1)
 def test_learner_without_a_buffer_imitates(algorithm: str, policy: str, parameters: dict[str, Any]) -> None:
     """What it has been shown it then does: much less of a random start is left; only then does it learn by itself."""
     shown = {"controller": "neutral", "steps": 320}

@@ -277,7 +277,7 @@ def test_markets_at_random_have_a_core(every: int) -> None:
     np.testing.assert_allclose(env.physical.stock.sum(axis=0), start, rtol=1e-12)
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_compiled_size_is_in_proportion_to_the_network() -> None:
     """World markets that pass to every region are kept, so that the regions are not joined to each other."""
     networks = [yearly_network(regions=regions) for regions in (30, 300)]
@@ -392,6 +392,7 @@ def chained(seed: int) -> Network:
 
 @given(seed=st.integers(0, 2**31))
 @settings(max_examples=8)
+@pytest.mark.slow
 def test_chains_of_stores_move_what_the_sparse_sum_does(seed: int) -> None:
     """Stages whose rates an agent sets move along slices of rows, all of them; without, flows are the same."""
 
@@ -415,6 +416,7 @@ def test_chains_of_stores_move_what_the_sparse_sum_does(seed: int) -> None:
 
 @given(seed=st.integers(0, 2**31))
 @settings(max_examples=6)
+@pytest.mark.slow
 def test_many_copies_move_along_chains_as_few_do(seed: int) -> None:
     """To the bit: many take slices of rows, few the sparse sum."""
     network, rng = chained(seed), np.random.default_rng(seed)

@@ -230,8 +230,8 @@ def test_flows_that_are_less_than_asked_prove_no_effort(reason: str) -> None:
     assert -solved.objective <= float(amounts["episode_cost"][0]) + 1e-6
 
 
-@pytest.mark.medium
 @given(network=substances_networks, seed=st.integers(0, 1000))
+@pytest.mark.slow
 def test_no_episode_with_substances_books_less_than_the_bound(network: Network, seed: int) -> None:
     """Shares of single substances, sorting, and orders that carry what the donor has."""
     _no_episode_is_below(network, seed)

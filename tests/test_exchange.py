@@ -25,6 +25,7 @@ from cirl_marl.report.data_package import read_package, write_package
 from cirl_marl.report.iamc import read_iamc, write_iamc
 
 
+@pytest.mark.slow
 def test_years_go_to_the_format_of_scenario_databases(tmp_path: Path) -> None:
     """Every stock, flow and amount stands there to the last digit, under its region; parts add up to the account."""
     world, japan = simulate("steel_world", steps=2), simulate("steel_japan", steps=2)

@@ -39,6 +39,7 @@ def write(path: Path, columns: Mapping[str, Sequence[object] | Floats], times: S
 
 
 @pytest.mark.parametrize(("count", "persistence"), [(120, 0.6), (200, 0.85), (120, -0.4)])
+@pytest.mark.sample(1)
 def test_noise_around_a_trend_is_found_within_its_errors(count: int, persistence: float) -> None:
     """Of many series: right on average, and two errors hold the truth some 95, of deviations 87 times in 100."""
     deviation, slope = 0.3, 0.01
@@ -58,8 +59,9 @@ def test_noise_around_a_trend_is_found_within_its_errors(count: int, persistence
     assert 0.87 < np.mean(np.abs(slopes[:, 0] - slope) < 1.96 * slopes[:, 1]) < 0.98
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize(("count", "persistence"), [(25, 0.8), (25, 0.3), (60, 0.8)])
+@pytest.mark.medium
+@pytest.mark.sample(1)
 def test_intervals_of_deviations_hold_in_short_series(count: int, persistence: float) -> None:
     """Of many series around a trend, all but some 5 in 100 hold the truth, which standard errors do not."""
     rng, found = np.random.default_rng(11), list[Autoregression]()

@@ -127,7 +127,6 @@ def test_networks_of_the_catalogue(name: str, monkeypatch: pytest.MonkeyPatch) -
     assert check(MultiAgentVectorEnv(name, num_envs=2, horizon=2), 1, monkeypatch) > 12
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize(
     ("base", "path"),
     [
@@ -140,6 +139,8 @@ def test_networks_of_the_catalogue(name: str, monkeypatch: pytest.MonkeyPatch) -
         ("power", "arcs.run_old.capacity_rate"),
     ],
 )
+@pytest.mark.medium
+@pytest.mark.sample(3)
 def test_what_disturbs(base: str, path: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Shares, capacities, limits and demand, of supplies that make up for services too."""
     bases = {"cycle": cycle(), "power": power()}

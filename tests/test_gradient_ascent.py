@@ -108,6 +108,7 @@ def test_gradients_go_through_the_policies(
 
 
 @pytest.mark.parametrize("algorithm", SQUASHED)
+@pytest.mark.sample(2)
 def test_actors_that_climbed_are_those_of_the_models(algorithm: str) -> None:
     """Each model does what the stack does, its target as well; critics stay, and what is paid at its prices grows."""
     parameters = BUFFERED | {"learning_rate": 0.03}

@@ -229,6 +229,7 @@ def test_teams(count: int, tmp_path: Path) -> None:
 
 
 @COUNTS
+@pytest.mark.slow
 def test_sweeps(count: int, bottles: Network, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A folder in which a cell is done, or still to be evaluated: what was asked for, results, bounds, progress."""
     assert bottles.source is not None

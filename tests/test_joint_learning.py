@@ -320,6 +320,7 @@ def shortened(name: str) -> Recipe:
     # a robot that is searched for by returns alone never touches a cube in so few steps, and its policy stays
     [pair for pair in product(JOINT_RECIPES, ONE_OF_EACH) if pair != ("independent_ars", "solids_net")],
 )
+@pytest.mark.sample(12)
 def test_every_recipe_learns_on_every_network(name: str, network: str) -> None:
     """The recipes of the catalogue train on each network, and their policies move."""
     learnt(network, shortened(name), horizon=4, seed=1)

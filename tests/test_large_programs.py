@@ -323,7 +323,7 @@ def test_simplex_is_tried_where_interior_points_do_not_do(
     assert tried == [*solver.SETTINGS][:count]
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_interior_points_alone_leave_good_multipliers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a generated cycle in merged pieces, where rows that presolve merges as parallel spoil them."""
     monkeypatch.setattr(program, "LARGE", 7000)
@@ -345,7 +345,7 @@ def test_interior_points_alone_leave_good_multipliers(monkeypatch: pytest.Monkey
     assert len(distances) > 2
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_few_choices_of_fast_stocks_tell_nearly_all(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of constant shares past fast stocks in merged pieces: another choice is not missed, each of these would be."""
     admissible = Admissible.of(yearly_network(110, LIFETIMES).with_options(episode={"horizon": 5}))

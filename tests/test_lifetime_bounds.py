@@ -270,9 +270,8 @@ def test_what_leaves_at_once_is_allowed(mean: float, deviation: float, degree: i
     assert bound(served, min_service=level * (1 - 1e-6), degree=degree).levels[0] >= level * (1 - 1e-5)
 
 
-@pytest.mark.medium
-@pytest.mark.sample(1)
 @pytest.mark.parametrize("seed", [3, 11, 32, 34, 48])
+@pytest.mark.slow
 def test_no_episode_of_a_generated_cycle_exceeds_its_bound(seed: int) -> None:
     """Neither random ones nor the plan, at the services that they have, whoever stretches lifetimes or supplies."""
     network = yearly_network(seed, replace(LIFETIMES, years=(8, 10), prolonged=0.7, supplied=0.7, idle=0.5))

@@ -115,7 +115,7 @@ def cohorts(distribution: str, deviation: float) -> tuple[Floats, Floats]:
     return found.outflow.values, found.stock.values
 
 
-@pytest.mark.sample(6)
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("ratio", [0.1, 0.2, 0.3, 0.45, 0.7])
 @pytest.mark.parametrize("distribution", ["normal", "folded_normal", "lognormal", "weibull"])
 def test_discards_are_those_of_cohorts(distribution: str, ratio: float) -> None:
@@ -192,6 +192,7 @@ def test_history_is_what_was_simulated_before(lifetime: Lifetime) -> None:
 
 
 @pytest.mark.parametrize("deviation", [0.11, 0.12, 0.16, 0.17, 0.18, 0.19, 0.2, 0.21])
+@pytest.mark.sample(3)
 def test_no_stage_of_what_has_shrunk_is_negative(deviation: float) -> None:
     """A shrinking inflow makes the solver change rows: round-off, of either sign, of stages that nothing enters."""
     chain = Lifetime(mean=1.0, deviation=deviation, distribution="normal").chain

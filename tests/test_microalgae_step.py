@@ -125,9 +125,10 @@ class TestAnyStep:
 class TestAccuracy:
     """Against scipy's Radau at a tolerance of 1e-10."""
 
-    @pytest.mark.medium
     @every_model
     @pytest.mark.parametrize("interval", [0.0125, 0.25])
+    @pytest.mark.medium
+    @pytest.mark.sample(3)
     def test_jumping_light(self, model: Model, interval: float) -> None:
         """X and Q to 1e-5 and the mean uptake to 1e-4, in every interval, from a start without nutrient."""
         reference = column(model, 26.0, 1.12, 0.0)
@@ -141,6 +142,7 @@ class TestAccuracy:
 
     @every_model
     @pytest.mark.parametrize("start", [(26.0, 1.0, 1e-3), (0.5, 1.0, 3.0), (1e-3, 0.2, 1e-3)])
+    @pytest.mark.sample(4)
     def test_second_order(
         self, model: Model, start: tuple[float, float, float], monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -225,6 +227,7 @@ class TestDrawDown:
 
     @pytest.mark.parametrize("outside", [0.0, 1e-4, 0.3, 50.0])
     @pytest.mark.parametrize("demand", [1e-3, 20.0, 45.0, 45.01, 60.0, 3000.0])
+    @pytest.mark.sample(8)
     def test_against_scipy(self, outside: float, demand: float) -> None:
         """S, ∫s dt and ∫e^(−D(t−τ)) s dτ, for demands below, at and above the supply of 45."""
         k = KINETICS["half_saturation"]

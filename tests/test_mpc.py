@@ -231,6 +231,7 @@ def cycle(horizon: int = 12) -> Network:
 
 
 @pytest.mark.parametrize("horizon", [None, 4])
+@pytest.mark.sample(1)
 def test_supplies_fill_what_plans_leave_and_products_come_back(horizon: int | None) -> None:
     """Mining fills the stock in use whatever is demanded, and windows know that what goes into use is discarded."""
     network, agents = cycle(), ("exports", "collection")
@@ -251,8 +252,9 @@ def test_weight_decides_whether_service_is_worth_its_price() -> None:
     assert busy.episode_service[0] > 0.999
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize(("name", "horizon"), [("copper_net", None), ("copper_net", 12), ("carbo_net", None)])
+@pytest.mark.medium
+@pytest.mark.sample(1)
 def test_keeps_the_service_from_random_starts(name: str, horizon: int | None) -> None:
     """From drawn starts it meets the demanded level, nearer than open-loop plans, within 3 % of the bound."""
     env = MultiAgentVectorEnv(name, num_envs=2, horizon=24)

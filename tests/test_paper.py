@@ -166,8 +166,9 @@ def test_same_seed_same_figures() -> None:
     assert first.evaluation == second.evaluation
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize("algorithm", ["SAC", "DDPG", "PPO"])
+@pytest.mark.medium
+@pytest.mark.sample(1)
 def test_weights_that_become_nan_are_a_result(
     algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

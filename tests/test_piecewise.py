@@ -387,7 +387,7 @@ def test_draws_and_disturbances_are_factors_on_all_pieces() -> None:
         assert isinstance(rates, PiecewiseRate) and isinstance(rates.factor, Series | float)
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_expected_costs_in_pieces_have_budgets() -> None:
     """What a tonne costs more beyond 4 is twice as much in an outage: what a budget buys at least is known."""
     order = Control(kind=ControlKind.FLOW, low=0.0, neutral=10.0, high=10.0)

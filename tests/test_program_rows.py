@@ -527,7 +527,7 @@ def test_the_most_that_is_delivered() -> None:
     assert most == pytest.approx(delivered, rel=1e-7)
 
 
-@pytest.mark.sample(5)
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("style", ["inside", "ends", "low", "high"])
 @pytest.mark.parametrize("merged", [False, True])
 @pytest.mark.parametrize("hoarded", [40.0, 0.0, 500.0])
@@ -626,7 +626,7 @@ def test_shares_of_what_orders_take_away(style: str) -> None:
         assert_holds(play(network, np.random.default_rng(degree), style), degree)
 
 
-@pytest.mark.sample(4)
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("merged", [False, True])
 @pytest.mark.parametrize(("past", "refilled"), [("sale", True), ("furnace", True), ("sale", False), ("furnace", False)])
 def test_shares_of_what_a_hoard_has_left(past: str, refilled: bool, merged: bool) -> None:

@@ -107,11 +107,12 @@ def test_the_papers_scenario_of_an_agent() -> None:
         single_agent_env("net_zero", agent="digester", scenario="paper")
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize(
     ("network", "agent"),
     [(name, agent) for name in ("net_zero", "solids_net") for agent in load_network(name).agents],
 )
+@pytest.mark.medium
+@pytest.mark.sample(2)
 def test_one_agent_is_all_agents_with_the_others_neutral(network: str, agent: str) -> None:
     """Bit for bit, in the default scenario."""
     one, all_ = single_agent_env(network, agent=agent, horizon=30), parallel_env(network, horizon=30)

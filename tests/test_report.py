@@ -106,9 +106,9 @@ def test_catalogue_is_readable(name: str) -> None:
             assert (np.abs(curve[:, None] - others) > layout.box / 2).any(axis=-1).all()
 
 
-@pytest.mark.medium
-@pytest.mark.sample(3)
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("size", [(2, 1), (3, 2), (9, 16), (20, 40), (50, 90), (2000, 4000)])
+@pytest.mark.medium
 def test_networks_of_any_size(tmp_path: Path, size: tuple[int, int]) -> None:
     """A digraph is drawn from a pair of nodes to thousands."""
     network = random_network(*size)
@@ -271,8 +271,9 @@ def test_window_needs_pygame(monkeypatch: pytest.MonkeyPatch) -> None:
         env.reset(seed=0)
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize("episodes", [0, 1, 12])
+@pytest.mark.medium
+@pytest.mark.sample(1)
 def test_circularity_curves(tmp_path: Path, episodes: int) -> None:
     """λ and service are drawn for any number of episodes, and for a single step."""
     network = cirl_marl.load_network("copper_net")
@@ -284,9 +285,9 @@ def test_circularity_curves(tmp_path: Path, episodes: int) -> None:
     read(save_circularity(tmp_path / "none.png", network, np.arange(3.0), {}, {}))
 
 
-@pytest.mark.medium
-@pytest.mark.sample(2)
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("agents", [0, 1, 2, 7, 20, 33])
+@pytest.mark.medium
 def test_learning_curves(tmp_path: Path, agents: int) -> None:
     """Any number of agents and of episodes, none included."""
     random = np.random.default_rng(0)

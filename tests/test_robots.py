@@ -236,7 +236,7 @@ class TestTasks:
             done |= robot.success(state, inputs)
         assert done.mean() >= 0.95
 
-    @pytest.mark.medium
+    @pytest.mark.slow
     def test_the_fetch_script_is_fast(self) -> None:
         """It earns about as much as the best learner of the paper, −11.45, which may have met another target."""
         state, earned = starts(Fetch(), 60, 3000), np.zeros(60)

@@ -193,7 +193,7 @@ def inside(run_of: MultiAgentVectorEnv, name: str, run: Any) -> Floats:
     return values
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_scripts_are_worth_having() -> None:
     """The truck brings 3 items in 4 s and rests at home; from half-way the freeboard is nearer to 1000 °C."""
     env = MultiAgentVectorEnv("solids_net", num_envs=1, scenario="reacher")

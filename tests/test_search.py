@@ -21,9 +21,9 @@ from cirl_marl.optimum.planned_episodes import Population, starting_states
 EVERYWHERE = PLAYED
 
 
-@pytest.mark.medium
-@pytest.mark.sample(12)
+@pytest.mark.sample(4)
 @pytest.mark.parametrize(("name", "scenario"), EVERYWHERE)
+@pytest.mark.medium
 def test_plan_achieves_what_it_says_and_no_less_than_its_candidates(name: str, scenario: str | None) -> None:
     """In each network a lone copy that replays the plan earns the figures that it was chosen for."""
     found = search(name, scenario=scenario, horizon=6, service_weight=1.0, knots=2, population=8, iterations=2)

@@ -109,6 +109,7 @@ def test_policies_near_the_last_serve_just_enough(
 
 
 @pytest.mark.parametrize(("engine", "share"), [("lockstep", 0.5), ("stacked", 1.0), ("gradients", 0.5)])
+@pytest.mark.sample(1)
 def test_the_last_update_is_evaluated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: str, share: float
 ) -> None:
@@ -132,9 +133,9 @@ def test_the_last_update_is_evaluated(
     np.testing.assert_array_equal(numbers(Trained(tmp_path / "run").policies["mine"]), last)
 
 
-@pytest.mark.medium
-@pytest.mark.sample(2)
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("demanded", [None, 0.0, 0.97, 1.0])
+@pytest.mark.medium
 def test_the_best_checkpoint_acts(tmp_path: Path, demanded: float | None) -> None:
     """It is the best row by the rule, its policies give the figures of that row again, and the choice is said."""
     run = learnt(tmp_path / "run", recipe(min_service=demanded))

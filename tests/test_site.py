@@ -87,9 +87,8 @@ def test_network_pages_say_what_definitions_say(name: str) -> None:
         assert all(content.startswith(b"\x89PNG") for content in pictures)
 
 
-@pytest.mark.medium
-@pytest.mark.sample(1)
 @pytest.mark.parametrize("name", cirl_marl.networks())
+@pytest.mark.slow
 def test_kept_plans_are_of_the_catalogue(name: str) -> None:
     """Each network has a bound and a plan of its definition as it is now, and the bound is not exceeded."""
     if name in LEFT_OUT:

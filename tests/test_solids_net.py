@@ -185,7 +185,7 @@ def staged(found: list[Stages], time: Floats, interval: float) -> Floats:
     return total
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(1)
 @both
 @controlled
 def test_circularity_is_the_sum_of_the_stages(scenario: str, name: str) -> None:
@@ -279,6 +279,7 @@ def test_snapshot_in_the_middle_of_an_attempt(scenario: str, tmp_path: Path) -> 
 
 
 @both
+@pytest.mark.sample(1)
 def test_views_and_copies_agree(scenario: str) -> None:
     """A batch of three, restarting by itself, is three lone environments, under PettingZoo and under Gymnasium."""
     network = quick(scenario, horizon=30)
@@ -314,6 +315,7 @@ def test_views_and_copies_agree(scenario: str) -> None:
 
 @both
 @pytest.mark.parametrize("reward", REWARDS)
+@pytest.mark.sample(4)
 def test_reward_mode_does_not_touch_the_physics(scenario: str, reward: str) -> None:
     """Counterfactuals of the difference reward use the same robot; the real one does not notice."""
     network = quick(scenario, horizon=25)
@@ -497,6 +499,7 @@ def test_networks_without_criticality_have_no_time_window() -> None:
     assert [arc.law for arc in solids.arcs] == [Law.BATCH] * 3
 
 
+@pytest.mark.slow
 def test_robots_failures_decide_the_coupling() -> None:
     """A robot that stands still loads the truck with everything, leaves nothing in second use, and lowers λ̄."""
     env = MultiAgentVectorEnv("solids_net", num_envs=1)
@@ -510,8 +513,8 @@ def test_robots_failures_decide_the_coupling() -> None:
     assert (stopped.episode_circularity > bad.episode_circularity).all()  # a truck that never arrives is best for λ
 
 
-@pytest.mark.sample(1)
 @pytest.mark.parametrize("scenario", ["default", "reacher"])
+@pytest.mark.slow
 def test_staying_away_does_not_pay(scenario: str) -> None:
     """A truck that never loads is good for λ, but it owes that nothing piles up, and earns less than one at work."""
     env = MultiAgentVectorEnv("solids_net", num_envs=1, scenario=scenario)

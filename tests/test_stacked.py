@@ -112,6 +112,7 @@ CASES: dict[str, Recipe] = {
 
 @pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
 @pytest.mark.parametrize("case", CASES)
+@pytest.mark.sample(6)
 def test_a_rollout_and_its_updates_are_those_of_the_library(case: str) -> None:
     """From the same weights and noise; two rollouts with ends of episodes within them."""
     assert_same(*both(CASES[case]))

@@ -88,6 +88,7 @@ def first(tmp_path_factory: pytest.TempPathFactory) -> tuple[Training, Path]:
 
 
 @pytest.mark.parametrize("algorithm", list(ALGORITHMS))
+@pytest.mark.sample(2)
 def test_policy_before_the_first_update_is_that_of_the_run(algorithm: str, tmp_path: Path) -> None:
     """With critics, entropy coefficient and statistics of observations; optimiser, steps and rewards begin anew."""
     source = train("copper_net", recipe(algorithm), directory=tmp_path / "first", **OPTIONS)

@@ -169,6 +169,7 @@ class Watches(BaseCallback):
 @pytest.mark.parametrize(
     "algorithm", [partial(PPO, **SMALL), partial(A2C, n_steps=6), partial(TRPO, n_steps=16, batch_size=16)]
 )
+@pytest.mark.sample(1)
 def test_absent_rows_are_not_learnt(algorithm: Any) -> None:
     """Every step in which the agent acted is in one minibatch, and nothing else is."""
     log: list[tuple[Any, ...]] = []

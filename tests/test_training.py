@@ -86,6 +86,7 @@ def assert_same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) ->
     assert [name for name in one if not torch.equal(one[name], other[name])] == []
 
 
+@pytest.mark.slow
 def test_ten_algorithms_in_one_run_are_reproducible(mixed_recipe: Recipe) -> None:
     """The same seed gives bit-identical weights, for on-policy, off-policy and evolutionary learners side by side."""
     first = train("copper_net", mixed_recipe, seed=4, horizon=10)
@@ -313,7 +314,7 @@ def test_failure_names_the_agent_and_keeps_what_was_learnt(tmp_path: Path, ppo_r
     assert set(controller.act(env.reset(seed=0))) == set(env.agents)
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("which", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_interruption_saves_and_resumption_finishes(
     which: int, tmp_path: Path, mixed_recipe: Recipe, ctrl_c_after: Any
@@ -370,6 +371,7 @@ def test_budgets_are_whole_numbers(options: dict[str, Any], ppo_recipe: Recipe) 
 
 
 @pytest.mark.parametrize("algorithm", ["PPO", "SAC", "ARS"])
+@pytest.mark.sample(1)
 def test_schedules_run_from_their_first_value_to_their_last(algorithm: str) -> None:
     """Each algorithm ends with the learning rate that the recipe ends with, and learns for the steps asked for."""
     parameters = {

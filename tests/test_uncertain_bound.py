@@ -185,7 +185,6 @@ def prices_of(network: Network, seed: int, size: float, demand: float, level_pri
     )
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize(
     ("horizon", "chain"),
     [
@@ -195,6 +194,8 @@ def prices_of(network: Network, seed: int, size: float, demand: float, level_pri
         pytest.param(6, CHAIN, marks=pytest.mark.slow),
     ],
 )
+@pytest.mark.medium
+@pytest.mark.sample(1)
 def test_the_bound_is_that_of_all_paths_at_once(horizon: int, chain: Markov) -> None:
     """With the multipliers of the extensive form it is its optimum; with others never less, with fitted ones near."""
     network = works(horizon, chain)
@@ -252,7 +253,7 @@ def proofs(paths: Paths, prices: Prices) -> tuple[Floats, Floats]:
     return values, np.array([prices.luck(program.draw.new) for program in paths.programs])
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_luck_of_draws_narrows_the_interval(works_paths: Paths, works_prices: tuple[Prices, Prices]) -> None:
     """What shocks by themselves add has mean 0 over all paths, and follows what draws are worth."""
     paths, (values, luck) = works_paths, proofs(works_paths, works_prices[0])
@@ -477,8 +478,9 @@ def merits(network: Network, found: Any, controller: Controller) -> tuple[Floats
     return circularity + found.prices.service_value(levels), np.einsum("itn,itn->i", weights, apart)
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize("lifetime", LIVES)
+@pytest.mark.medium
+@pytest.mark.sample(1)
 def test_prices_stand_on_all_that_is_in_use(lifetime: Lifetime) -> None:
     """With a lifetime the simulator has stages or slots and the program vintages: no policy earns more in any draw."""
     order = Control(kind=ControlKind.FLOW, low=5.0, neutral=10.0, high=15.0)
@@ -507,7 +509,7 @@ def test_prices_stand_on_all_that_is_in_use(lifetime: Lifetime) -> None:
 SEEDS = range(40)
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_substeps_of_large_programs_are_merged(monkeypatch: pytest.MonkeyPatch) -> None:
     """Then a draw's program has one piece for an interval, proves nearly as much, and no less than what happens."""
     network = load_network("car_batteries").scenario("adoption").with_options(episode={"horizon": 8})

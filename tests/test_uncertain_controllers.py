@@ -175,6 +175,7 @@ def test_feedback_is_between_the_blind_and_the_best() -> None:
     assert merits["constant"] <= merits["schedule"] + 1e-3 * abs(best)
 
 
+@pytest.mark.slow
 def test_who_sees_late_plans_for_what_follows_from_what_it_saw() -> None:
     """Conditional means given the states of earlier intervals; before these there is nothing to act on."""
     network = works(6)
@@ -201,7 +202,7 @@ def test_who_sees_late_plans_for_what_follows_from_what_it_saw() -> None:
         MPC(delay=-1)
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_what_is_sold_is_not_held_back_in_plans() -> None:
     """Of a store that sells what it holds, scenario MPC orders as the best policy does; plans cannot ration sales."""
     network, price = stockist(5), 1.7

@@ -194,8 +194,8 @@ def quarterly(horizon: int = 8) -> Network:
     return replace(network, accounts=tuple(replace(each, discount=0.5) for each in ACCOUNTS))
 
 
-@pytest.mark.sample(1)
 @pytest.mark.parametrize(("replan", "share"), [(2, None), (3, 0.9)])
+@pytest.mark.slow
 def test_mpc_keeps_budgets_per_year(replan: int, share: float | None) -> None:
     """In each copy and in each of its episodes; beside one of the episode, which is discounted."""
     network = quarterly()
