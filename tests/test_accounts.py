@@ -33,6 +33,7 @@ from cirl_marl import (
     Node,
     Role,
     Series,
+    Service,
     compare,
     gradient,
     levers,
@@ -178,6 +179,7 @@ def test_vector_rewards_add_up_to_what_is_reported() -> None:
     """λ̄, levels and totals of an episode, each by itself, and the same for all; a finished episode pays nothing."""
     env = mo_parallel_env(city(), horizon=4)
     assert env.reward_names == ("circularity", "paper_delivered", "cost", "emissions")
+    assert len({id(space) for space in env.reward_spaces.values()}) == len(env.possible_agents)
     env.reset(seed=2)
     rewards = []
     while env.agents:
@@ -283,6 +285,8 @@ def test_what_cannot_be_asked_for_is_told() -> None:
         ({"accounts": (Account(id="cost", unit="appels"),)}, "cannot be read"),
         ({"accounts": (Account(id="circularity", unit="t"),)}, "names a figure of every episode"),
         ({"accounts": (Account(id="cost", unit="t"), Account(id="cost", unit="t"))}, "used twice"),
+        ({"accounts": (Account(id="cost", unit=""),)}, "write '1' for a number without unit"),
+        ({"services": (Service(id="cost", provider="out", quantity="flow", low=0.1),)}, "a service has the same id"),
         ({"accounts": (Account(id="costs", unit="EUR_2023"),)}, "Did you mean 'costs'"),
     ],
 )

@@ -147,6 +147,8 @@ def test_budgets_of_expected_amounts_that_cannot_be_meant_are_refused(kept: Any)
         small_bound({"cost/year": 0.1}, None)
     least = -bound(expected_network(emitting(1)), aim="cost", degree=1).objective
     assert least < float(re.findall(text, str(raised.value))[0]) < 2 * least
+    with pytest.raises(CirlError, match=r"no policy reaches .* draws, expected emissions at most 0\.1 t CO2e\)"):
+        small_bound({"emissions": 0.1})
     with pytest.raises(CirlError, match=r"unknown account 'emission'\. Did you mean 'emissions'"):
         small_bound({"emission": 0.1})
     with pytest.raises(CirlError, match="those of a bound with budgets, which no plan of one interval can keep"):

@@ -36,8 +36,8 @@ class MOParallelEnv(NetworkParallelEnv):
         super().__init__(network, **options)
         services, accounts = self.network.services, self.network.accounts
         self.reward_names = (CIRCULARITY, *(each.id for each in services), *(each.id for each in accounts))
-        space = Box(-np.inf, np.inf, (len(self.reward_names),), np.float32)
-        self.reward_spaces = dict.fromkeys(self.possible_agents, space)
+        shape = (len(self.reward_names),)
+        self.reward_spaces = {agent: Box(-np.inf, np.inf, shape, np.float32) for agent in self.possible_agents}
 
     def reward_space(self, agent: str) -> Box[np.float32]:
         """Return the space of the rewards of ``agent``."""

@@ -232,7 +232,7 @@ def aims_of(network: Network, aim: Aim, at_most: Mapping[str, float] | None, *, 
             λ̄ or a service, weights that are all 0, or a budget of the account that alone is kept low.
     """
     accounts = [account.id for account in network.accounts]
-    services = [service.id for service in network.services if with_services and service.id not in accounts]
+    services = [service.id for service in network.services if with_services]
     names = [CIRCULARITY, *accounts, *services]
     if not isinstance(aim, str | Mapping):
         raise CirlError(f"aim: give '{CIRCULARITY}', an account, or {{name: weight}}, got {aim!r}")

@@ -21,6 +21,7 @@ from scipy import optimize, sparse
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record
+from cirl_marl.optimum.aims import budget_texts
 from cirl_marl.optimum.certificate import Certificate
 from cirl_marl.optimum.draws import DrawProgram, DrawProof, Prices, knot_weights, past_of, shocks
 from cirl_marl.optimum.solver import Basis
@@ -197,7 +198,8 @@ def _check_reach(sample: Sample, trial: PriceTrial, scale: float) -> None:
     for s in np.flatnonzero((levels < prices.demand - SHORT) & (prices.service > OUT_OF_REACH * scale)).tolist():
         if s < services:
             text = f"reaches an expected level of {prices.demand[s]:g} of '{network.services[s].id}' (at most"
-            raise CirlError(f"no policy {text} {levels[s]:.6g} in {count} draws)")
+            beside = "".join(f", expected {budget}" for budget, _ in budget_texts(network, aims))
+            raise CirlError(f"no policy {text} {levels[s]:.6g} in {count} draws{beside})")
         budget, amount = aims.budgets[s - services], -levels[s] * aims.sizes[s - services]
         note = f"(at the highest price that was tried {count} draws come to {amount:.6g})"
         raise CirlError(f"no policy keeps an expected {budget.text(network)} {note}")

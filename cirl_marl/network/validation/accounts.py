@@ -17,11 +17,14 @@ RESERVED = (CIRCULARITY, "service_level")
 
 def account_problems(network: Specification) -> Iterator[str]:
     """Yield every mistake in the accounts of ``network``."""
+    services = [service.id for service in network.services]
     for account in network.accounts:
         subject = f"account '{account.id}'"
         yield from bound_problems(account, f"{subject}: ")
         if account.id in RESERVED:
             yield f"{subject}: the id names a figure of every episode; choose another"
+        if account.id in services:
+            yield f"{subject}: a service has the same id, and aims and costs by name would be of either; choose another"
         try:
             factor(account.unit, account.unit)
         except CirlError as error:
