@@ -300,6 +300,12 @@ def test_accounts_that_cannot_be_meant_are_refused(change: dict[str, Any], messa
     with pytest.raises(NetworkError, match="accounts must be 'cost': a number, got 'much'"):
         much: Any = {"cost": "much"}
         replace(network.arcs[0], accounts=much)
+    with pytest.raises(NetworkError, match="accounts must be 'cost': once, got it 2 times"):
+        replace(network.arcs[0], accounts=(("cost", 1.0), ("cost", 2.0)))
+    number: Any = 1
+    for part in (network.accounts[0], network.arcs[0], network.nodes[0]):
+        with pytest.raises(NetworkError, match=" 1: id must be text"):
+            replace(part, id=number)
     with pytest.raises(NetworkError, match="it stores nothing; charge what enters it"):
         replace(
             network,

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import textwrap
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, MISSING, dataclass, fields, replace
 from datetime import date, datetime
@@ -224,10 +225,12 @@ class Rates(Declaration):
         pairs = value if isinstance(value, tuple) else ()
         if not isinstance(value, tuple) or not all(isinstance(pair, tuple) and len(pair) == 2 for pair in pairs):
             return f"{{{self.of}: number, …}}, got {value!r}"
+        names = Counter(str(name) for name, _ in pairs)
         pairs = tuple(pair for pair in pairs if self.of != "account" or not isinstance(pair[1], Scalable))
         truths = (f"{name!r}: a number, got {number!r}" for name, number in pairs if isinstance(number, bool))
         faults = (f"{name!r}: {fault}" for name, number in pairs if (fault := self.number.problem(number)))
-        return next(chain(truths, faults), "")
+        repeated = (f"{name!r}: once, got it {count} times" for name, count in names.items() if count > 1)
+        return next(chain(truths, faults, repeated), "")
 
 
 Amount = partial(Numbers, form="a number", shape=(), table_form="amount", varies=True)
@@ -323,6 +326,8 @@ class CheckedRecord:
     def __post_init__(self) -> None:
         """Check every field; take words of enumerations as definitions spell them."""
         kind = type(self).__name__.lower()
+        if not isinstance(id_ := getattr(self, "id", ""), str):
+            raise NetworkError(f"{kind} {id_!r}", ["id must be text"])
         check_types(f"{kind} '{self.id}'" if hasattr(self, "id") else kind, self)
 
 
