@@ -205,6 +205,9 @@ def test_stocks_are_where_a_store_begins(tmp_path: Path) -> None:
     assert found.stock_mistakes == {"Use": pytest.approx(0.5)} and not found.processes.inferred_stores
     network = load_network(tmp_path / "metal.toml")
     assert network.initial[:, network.node_index["use"]] == pytest.approx([50.0, 50.0])
+    stocks = table(tmp_path / "late_table.csv", rows[1:], ["process", "year", "value", "unit"])
+    with pytest.raises(CirlError, match="'Use' has one of 2000 and none of 1999, with which it starts; give it"):
+        import_flows(flows, tmp_path / "late.toml", stocks, roles=ROLES)
     rows[0][2] = 0.5
     stocks = table(tmp_path / "few_table.csv", rows, ["process", "year", "value", "unit"])
     message = r"does not give back 'Old scrap' to 'Smelter' in 2000: .* a store may run empty"

@@ -116,6 +116,7 @@ def import_flows(
     table = Processes(table, holders).mix_substances()
     processes = Processes(table, holders)
     _check_stores(processes, stores)
+    _check_first_stocks(table, processes, known_stocks)
     _check_stock_contents(stocks, table, processes, contents)
     reconciliation: Reconciliation | None = None
     residuals = processes.residuals
@@ -207,6 +208,20 @@ def _check_stock_contents(path: Path | None, table: FlowTable, processes: Proces
             if not before <= year <= last:
                 years = f"the start, the end of {before}, and ends of years to {last}"
                 raise CirlError(f"{subject} contents of stocks are of {years}; leave it out")
+
+
+def _check_first_stocks(table: FlowTable, processes: Processes, stocks: Mapping[StockKey, float]) -> None:
+    """Refuse stocks of processes of which none is that at the start, as they would start with another.
+
+    Raises:
+        CirlError: naming the first of them.
+    """
+    before, kinds = table.years[0] - 1, (ProcessKind.STORE, ProcessKind.SOURCE)
+    at_start = {process for _, process, year in stocks if year == before}
+    for _, process, year in stocks:
+        if process not in at_start and processes.kinds[process] in kinds:
+            fault = f"'{process}' has one of {year} and none of {before}, with which it starts"
+            raise CirlError(f"stocks: {fault}; give it: stocks are those at ends of years")
 
 
 def _stock_processes(table: FlowTable, stocks: Mapping[tuple[str, str, int], float]) -> list[str]:
