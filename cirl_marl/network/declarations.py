@@ -229,8 +229,8 @@ class Rates(Declaration):
         pairs = tuple(pair for pair in pairs if self.of != "account" or not isinstance(pair[1], Scalable))
         truths = (f"{name!r}: a number, got {number!r}" for name, number in pairs if isinstance(number, bool))
         faults = (f"{name!r}: {fault}" for name, number in pairs if (fault := self.number.problem(number)))
-        repeated = (f"{name!r}: once, got it {count} times" for name, count in names.items() if count > 1)
-        return next(chain(truths, faults, repeated), "")
+        repetitions = (f"{name!r}: once, got it {count} times" for name, count in names.items() if count > 1)
+        return next(chain(truths, faults, repetitions), "")
 
 
 Amount = partial(Numbers, form="a number", shape=(), table_form="amount", varies=True)

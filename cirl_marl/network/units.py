@@ -47,7 +47,7 @@ MISSPELT = {"y": "year", "T": "t (tonne)", "MT": "Mt (megatonne)"} | dict.fromke
 
 CURRENCY = re.compile(r"[kMG]?([A-Z]{3})(_(?:18|19|20)\d\d)?")
 """A currency, with a prefix and the year of its prices, such as ``MEUR_2023``."""
-OTHER_CURRENCY = re.compile(r"[A-Za-z]{0,2}([A-Za-z]{3})_?((?:18|19|20)\d\d)")
+CURRENCY_VARIANT = re.compile(r"[A-Za-z]{0,2}([A-Za-z]{3})_?((?:18|19|20)\d\d)")
 """How a currency and year are written otherwise; ``TEUR_2023`` are thousands for some, and trillions for pint."""
 EMISSION = re.compile(r"(|kg|g|[kMG]?t)_?(?i:CO2)_?(?i:e|eq|equiv)?")
 """How equivalents of carbon dioxide are written, with a mass before them or not."""
@@ -75,9 +75,9 @@ def _check_form(unit: str) -> None:
 def _define_currency(unit: str, symbol: str) -> None:
     """Let pint know a currency of some year, a dimension of its own, as no factor that it knows leads to another."""
     currency, registry = CURRENCY.fullmatch(symbol), _registry()
-    other = OTHER_CURRENCY.fullmatch(symbol)
-    if currency is None and other is not None:
-        remedy = f"{other[1].upper()}_{other[2]}, or with k, M or G before it"
+    variant = CURRENCY_VARIANT.fullmatch(symbol)
+    if currency is None and variant is not None:
+        remedy = f"{variant[1].upper()}_{variant[2]}, or with k, M or G before it"
         raise CirlError(f"unit '{unit}': for '{symbol}' write {remedy}")
     if currency is None or symbol in registry:
         return
