@@ -25,13 +25,13 @@ from cirl_marl.optimum import Sampling, UncertainBound, bound
 from cirl_marl.optimum.options import demanded_levels
 from cirl_marl.records.files import write_atomically
 from cirl_marl.report.benchmark_tables import TABLES, save_profiles
-from cirl_marl.suite.held_out import VARIANTS
 from cirl_marl.suite.result_rows import read_rows
 from cirl_marl.suite.task_bounds import TaskBound, row_names, values_at
 from cirl_marl.suite.tasks import (
     CONTROLLERS,
     DECLARATION,
     HELD_OUT_EPISODES,
+    VARIANTS,
     BenchmarkTask,
     algorithms,
     load_task,

@@ -44,7 +44,7 @@ from cirl_marl.network.uncertainty import Spread, factor_ranges, network_of_inte
 from cirl_marl.network.validation import content_limits
 from cirl_marl.optimum.options import with_margin
 from cirl_marl.reasons.prices import with_bound
-from cirl_marl.suite.held_out import variant_of
+from cirl_marl.suite.tasks import variant_of
 
 SPREAD = Spread(low=0.5, high=1.2, distribution="uniform")
 

@@ -35,10 +35,9 @@ from cirl_marl.optimum.program import Program, Programs
 from cirl_marl.report.benchmark_tables import aggregate_cells, gap_cells, held_out_cells, save_profiles
 from cirl_marl.suite import row_jobs
 from cirl_marl.suite import tasks as declared
-from cirl_marl.suite.held_out import SPREAD
 from cirl_marl.suite.result_rows import ResultRow, add_rows, is_reproduced, key_of, last_digit, read_rows, verify
 from cirl_marl.suite.task_bounds import TaskBound, row_names, rows_path, values_at
-from cirl_marl.suite.tasks import PACKAGE_DATA, algorithms, load_algorithm
+from cirl_marl.suite.tasks import PACKAGE_DATA, SPREAD, algorithms, load_algorithm
 from cirl_marl.suite.weights import LARGEST_FILE, read_weights, write_weights
 
 ALL_WEIGHTS = 4_000_000

@@ -201,7 +201,7 @@ def test_a_cell_is_a_training_and_its_evaluation(asked: Path) -> None:
 def test_gaps_are_shown_while_cells_train(asked: Path) -> None:
     """That of the best policies so far, to a bound for the middle of the initial ranges."""
     from cirl_marl.optimum import bound
-    from cirl_marl.sweeps.fronts import FrontJob
+    from cirl_marl.sweeps.running import FrontJob
 
     cell = cells_of(load_sweep(asked))[0]
     front = FrontJob.of(cell, Path("bounds"))

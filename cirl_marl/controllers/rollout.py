@@ -10,7 +10,7 @@ import numpy as np
 
 from cirl_marl.controllers.basic import Arrays, Controller, Planner
 from cirl_marl.dynamics.laws import LAWS
-from cirl_marl.environments.present import PresentEnv
+from cirl_marl.environments.starts import Starts
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import ControlError, instance_of, whole_number
 from cirl_marl.network import Floats, Network
@@ -95,6 +95,23 @@ class Rollout:
     def least_service(self) -> Floats:
         """Mean level of the service that lacks most in each episode, shape (B,); 1 without services."""
         return np.asarray(self.episode_levels.min(axis=1, initial=1.0))
+
+
+class PresentEnv(MultiAgentVectorEnv):
+    """A copy of an environment that knows what disturbances were and are, not what they will be.
+
+    Its random streams are others, so that nobody sees the future by going ahead in it, or by starting it again.
+    """
+
+    def __init__(self, env: MultiAgentVectorEnv) -> None:
+        """Copy an environment that was reset."""
+        self.__dict__.update(env.__dict__)
+        self._starts = Starts(self.network, self.dynamics, self.num_envs, self.layout.array_order)
+        self.follow(env)
+
+    def follow(self, env: MultiAgentVectorEnv) -> None:
+        """Go to where the environment is by now."""
+        self._state, self.episodes, self.controls = env.physical.without_future(), env.episodes, env.controls
 
 
 def rollout(

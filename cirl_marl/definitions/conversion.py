@@ -15,14 +15,14 @@ from cirl_marl.definitions.data_files import DataFiles
 from cirl_marl.definitions.error_messages import parameter_mistakes
 from cirl_marl.definitions.quantities import AmountColumn, AmountSeries, PiecesTable, QuantityTable, Range, RecordColumn
 from cirl_marl.definitions.schema import Batches, ModelTable, NetworkTable
-from cirl_marl.definitions.series_tables import Clock, column_value, inline_series, product
+from cirl_marl.definitions.series_tables import Clock, column_value, inline_series
 from cirl_marl.errors import CirlError, NetworkError, unknown_name
 from cirl_marl.network import Network, elements
 from cirl_marl.network.declarations import Declaration, Numbers, Quantity, Rates, Subtable, declarations
 from cirl_marl.network.disturbances import KINDS, Correlation, DisturbanceEffect
 from cirl_marl.network.elements import LAW_FIELDS, Arc, Control, ControlKind, Law, Node
 from cirl_marl.network.piecewise import PiecewiseRate
-from cirl_marl.network.series import Series, Value, extremes
+from cirl_marl.network.series import Series, Value, extremes, product
 from cirl_marl.network.uncertainty import Spread
 from cirl_marl.network.units import factor
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import date
 from functools import lru_cache
 
@@ -74,14 +74,3 @@ def _column_value(
     last = times[-1] - times[-2] if len(times) > 1 else factor(table.time_unit or "year", clock.unit)
     until = times[-1] + last if table.interpolation == "step" else None
     return Series(times=times, values=values, interpolation=table.interpolation, until=until, origin=column.origin)
-
-
-def product(value: Value, factor_: Value) -> Value:
-    """Return a number or series times another."""
-    if isinstance(value, Series):
-        if isinstance(factor_, Series):
-            return replace(value, factor=factor_)
-        return replace(value, values=tuple(number * factor_ for number in value.values))
-    if isinstance(factor_, Series):
-        return replace(factor_, values=tuple(value * number for number in factor_.values))
-    return value * factor_

@@ -195,3 +195,14 @@ def means(value: Value, edges: Floats) -> Floats:
 def extremes(value: Value) -> tuple[float, float]:
     """Return the lowest and the highest value."""
     return value.extremes if isinstance(value, Series) else (value, value)
+
+
+def product(value: Value, factor_: Value) -> Value:
+    """Return a number or series times another."""
+    if isinstance(value, Series):
+        if isinstance(factor_, Series):
+            return replace(value, factor=factor_)
+        return replace(value, values=tuple(number * factor_ for number in value.values))
+    if isinstance(factor_, Series):
+        return replace(factor_, values=tuple(value * number for number in factor_.values))
+    return value * factor_

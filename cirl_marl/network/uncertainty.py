@@ -24,7 +24,7 @@ from cirl_marl.network.declarations import (
 from cirl_marl.network.elements import FIXED_LIFETIME, Arc, Compartment, Control, ControlKind, Law, Node, Service
 from cirl_marl.network.initial_ages import content_edges
 from cirl_marl.network.rowsum import Floats, Integers, single_column
-from cirl_marl.network.series import Series, Value, extremes, in_intervals, means, series_of
+from cirl_marl.network.series import Series, Value, extremes, in_intervals, means, product, series_of
 from cirl_marl.network.specification import Specification
 from cirl_marl.network.split_fractions import ROUNDING, Split, proportions, splits, trap_problems
 from cirl_marl.network.substances import (
@@ -402,7 +402,7 @@ def _times(network: Specification, value: Value, factor: float, most: float = ma
     if extremes(value)[1] * factor > most:
         means = np.minimum(network.interval_means(value) * factor, most)
         return in_intervals(means, network.episode.control_interval)
-    return replace(value, values=tuple(part * factor for part in value.values))
+    return product(value, factor)
 
 
 def widest_splits(network: Specification, ranges: Mapping[str, tuple[float, float]]) -> list[Split]:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.errors import CirlError, unknown_name, whole_number
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.series import Series, Value
+from cirl_marl.network.series import product
 from cirl_marl.optimum.vintages import Lifetimes
 
 DEGREE = 2
@@ -130,13 +130,7 @@ def with_margin(network: Network, margin: float) -> Network:
         return network
     factors = (1.0 / margin if service.substance else margin for service in network.services)
     services = (
-        replace(s, low=_times(s.low, margin), high=_times(s.high, factor))
+        replace(s, low=product(s.low, margin), high=product(s.high, factor))
         for s, factor in zip(network.services, factors, strict=True)
     )
     return network.variant(services=tuple(services))
-
-
-def _times(value: Value, factor: float) -> Value:
-    if isinstance(value, Series):
-        return replace(value, values=tuple(factor * part for part in value.values))
-    return factor * value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
@@ -22,9 +23,13 @@ from cirl_marl.evaluation.statistics import SHARE, Aggregate, over_episodes
 from cirl_marl.learners.recipe import Recipe, load_recipe
 from cirl_marl.network import Network
 from cirl_marl.network.declarations import frozen_record, positional_record
+from cirl_marl.network.series import product
 from cirl_marl.records.files import sha256_of
-from cirl_marl.suite.held_out import VARIANTS, variant_of
 from cirl_marl.suite.task_bounds import TaskBound
+
+VARIANTS = (1, 2, 3)
+SPREAD = 0.05
+"""Numbers are multiplied by factors that are uniform within 1 ± SPREAD."""
 
 DECLARATION = Path(__file__).with_name("suite.toml")
 PACKAGE_DATA = Path(__file__).with_name("kept")
@@ -86,10 +91,6 @@ class BenchmarkTask:
             raise CirlError(f"task '{self.name}': held-out variants are {list(VARIANTS)}, got {variant!r}")
         episodes = min(self.episodes, HELD_OUT_EPISODES)
         return replace(self, variant=variant, seed=100 + variant, episodes=episodes)
-
-    def base_task(self) -> BenchmarkTask:
-        """Return the task of which this is a variant, or itself."""
-        return load_task(self.name)
 
     def env(self, episodes: int | None = None, **options: Any) -> MultiAgentVectorEnv:
         """Return the environment of the evaluation, with a copy for each episode; ``options`` as ``vector_env``'s."""
@@ -205,3 +206,27 @@ def load_algorithm(name: str) -> SuiteAlgorithm:
 @cache
 def _declaration() -> dict[str, Any]:
     return read_toml(DECLARATION)
+
+
+def variant_of(network: Network, variant: int) -> Network:
+    """Return a network whose rates (of arcs and nodes), demands and initial ranges are multiplied by random factors.
+
+    Both ends of a band or a range have one factor. The factors depend on network, scenario and variant alone.
+    """
+    key = zlib.crc32(f"{network.name}.{network.scenario_name}".encode())
+    generator = np.random.default_rng([key, variant])
+
+    def with_factor(part: Any, *names: str) -> Any:
+        factor = float(generator.uniform(1.0 - SPREAD, 1.0 + SPREAD))  # drawn if it is not used, too: parts keep theirs
+        numbers = {name: value for name in names if (value := getattr(part, name))}
+        return replace(part, **{name: _times(value, factor) for name, value in numbers.items()})
+
+    nodes = tuple(with_factor(with_factor(node, "rate"), "initial") for node in network.nodes)
+    arcs = tuple(with_factor(arc, "rate") for arc in network.arcs)
+    services = tuple(with_factor(service, "low", "high") for service in network.services)
+    return network.variant(nodes=nodes, arcs=arcs, services=services)
+
+
+def _times(value: Any, factor: float) -> Any:
+    """Return a number, a series or both ends of a range times a factor."""
+    return tuple(factor * end for end in value) if isinstance(value, tuple) else product(value, factor)

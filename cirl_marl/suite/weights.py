@@ -20,7 +20,7 @@ from cirl_marl.errors import RunError
 from cirl_marl.optimum.blind import Replay
 from cirl_marl.optimum.mpc import MPC
 from cirl_marl.records.files import sha256_of, write_atomically
-from cirl_marl.suite.tasks import BenchmarkTask
+from cirl_marl.suite.tasks import BenchmarkTask, load_task
 
 LARGEST_FILE = 64_000
 """Bytes of a file of weights, at most: policies of the suite are small."""
@@ -87,7 +87,7 @@ def controller_of(
         folder = Path(tempfile.mkdtemp(prefix="cirl_marl-")) / f"{task.name}-{algorithm}"
         atexit.register(shutil.rmtree, folder.parent, ignore_errors=True)
     try:
-        run = rebuild_run(folder, arrays, description, task.base_task().network())
+        run = rebuild_run(folder, arrays, description, load_task(task.name).network())
     except RunError as error:
         raise RunError(f"{path}: {error}") from error
     config = run.config
