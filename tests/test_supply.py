@@ -745,9 +745,6 @@ def test_files_hold_it(tmp_path: Path) -> None:
     assert load_network(str(tmp_path / "town.toml")).arcs == network.arcs
 
 
-BASE = town((0.25, 0.75))
-
-
 @pytest.mark.parametrize(
     ("weights", "changed", "said"),
     [

@@ -38,7 +38,6 @@ TERMS = 16
 """Flows up to which the formula of λ names each."""
 SAME = 1e-6
 """Relative difference of λ̄ that rounding makes between machines."""
-COUNTED = {1.0: "−", -1.0: "+"}
 
 
 def network_page(name: str) -> GeneratedPage:
