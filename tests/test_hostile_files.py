@@ -26,7 +26,7 @@ from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 import cirl_marl
 from cirl_marl import CirlError, LearnerError, RunError, Team
 from cirl_marl.evaluation.assessment import evaluate
-from cirl_marl.jobs.work import JobFiles
+from cirl_marl.jobs.work import JobFiles, last_line
 from cirl_marl.learners.checkpoint import model_state, set_model_state
 from cirl_marl.learners.interface import Trained, resume, train
 from cirl_marl.learners.recipe import Recipe
@@ -305,7 +305,7 @@ def test_what_never_ends_is_not_opened(unfinished: Path, tmp_path: Path) -> None
         log.truncate(2**40)
         log.seek(2**40)
         log.write(b"\nthe pen breaks\n")
-    assert files.last_words() == "the pen breaks"
+    assert last_line(files.log) == "the pen breaks"
 
 
 class Walk(ParallelEnv):  # type: ignore[misc]

@@ -221,8 +221,8 @@ def plan(
     from cirl_marl.evaluation import plans
     from cirl_marl.report.decisions import NO_WORKBOOK, decisions_table, savings_table, write_decisions
 
-    if out is not None and out.suffix != ".csv":
-        raise CirlError(f"--out {out}: needs the name of a .csv file")
+    if out is not None:
+        common.file_for(out, "--out", ".csv")
     page = common.page_for(html)
     options: dict[str, Any] = {"scenario": scenario, "min_service": min_service, "seed": seed, "smooth": smooth}
     options |= {"aim": _aim(aim), "at_most": common.budgets(at_most)}

@@ -9,7 +9,6 @@ import typer
 
 from cirl_marl.cli import common
 from cirl_marl.cli.common import COMPARISONS, EpisodeCount, NetworkName, Scenario, Seed, app, console, say, shares
-from cirl_marl.errors import CirlError
 
 
 @app.command(rich_help_panel=COMPARISONS)
@@ -110,11 +109,7 @@ def infer(
     from cirl_marl.report.objective_weights import weights_sentences, weights_table, write_weights
 
     if out is not None:
-        if out.suffix != ".csv":
-            raise CirlError(f"--out {out}: needs the name of a .csv file")
-        if out.is_dir():
-            raise CirlError(f"--out {out}: is a folder, not a file")
-        common.folder_for(out.parent, "--out")
+        common.file_for(out, "--out", ".csv")
     kinds = KINDS if terms is None else common.comma_separated(terms)
     options: dict[str, Any] = {"scenario": scenario, "seed": seed, "episodes": episodes, "seconds": seconds}
     with common.bar("weighing") as progress:

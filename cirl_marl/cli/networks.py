@@ -124,9 +124,7 @@ def show(
     circularity = float(definition.circularity(flow))
     common.console.print(f"λ of the start state: {circularity:.5g} {definition.mass_unit}")
     common.say(f"start: {start.description}")
-    path = picture or Path(f"{common.stem(definition)}.png")
-    if path.suffix != ".png":
-        raise CirlError(f"--picture {path}: needs the name of a .png file")
+    path = common.file_for(picture or Path(f"{common.stem(definition)}.png"), "--picture", ".png")
     colours = None
     if substance is not None:
         place = names.index(substance)

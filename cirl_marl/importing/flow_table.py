@@ -111,6 +111,7 @@ def _order_of_appearance(numbers: Integers) -> tuple[Integers, Integers]:
     return different[order], np.argsort(order)[place]
 
 
+@no_collection()
 def read_flows(path: Path, *, sheet: str | None = None, unit: str | None = None, year: int | None = None) -> FlowTable:
     """Read a table of flows.
 
@@ -129,22 +130,17 @@ def read_flows(path: Path, *, sheet: str | None = None, unit: str | None = None,
     Raises:
         CirlError: naming file, line, column and value, with what to do.
     """
-    with no_collection():
-        return _read_flows(path, sheet, unit, year)
-
-
-def _read_flows(path: Path, sheet: str | None, default_unit: str | None, default_year: int | None) -> FlowTable:
     regions: dict[str, int] = {}
     pairs: dict[Connection, int] = {}
     parts: list[_Entries] = []
     units: dict[str, str] = {}
     substances = SubstanceRows()
-    if default_year is not None and not 1 <= default_year <= LAST_YEAR:
-        raise CirlError(f"--year {default_year}: is no year from 1 to {LAST_YEAR}")
+    if year is not None and not 1 <= year <= LAST_YEAR:
+        raise CirlError(f"--year {year}: is no year from 1 to {LAST_YEAR}")
     for grid in read_grids(path, sheet):
         long = {"source", "target"} <= grid.places.keys() or len(LONG & grid.places.keys()) > 2
-        of_grid = _long(grid, default_year, regions, pairs, substances) if long else None
-        for entries in of_grid or _matrix(grid, default_year, regions, pairs):
+        of_grid = _long(grid, year, regions, pairs, substances) if long else None
+        for entries in of_grid or _matrix(grid, year, regions, pairs):
             parts.append(entries)
             for unit_of_row, line in entries.units.items():
                 units.setdefault(unit_of_row, f"{grid.name}, line {line}")
@@ -162,7 +158,7 @@ def _read_flows(path: Path, sheet: str | None, default_unit: str | None, default
     _check_names(table, parts)
     _check_repetitions(table, parts)
     _check_years(table)
-    unit = _unit(path, units, default_unit)
+    unit = _unit(path, units, unit)
     table = _per_year(replace(table, unit=unit))
     if not substances.entries:
         return table

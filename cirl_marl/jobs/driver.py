@@ -14,7 +14,7 @@ from filelock import Timeout
 from cirl_marl.definitions.code_permission import is_code_allowed
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.jobs.places import Worker, Workplace, place_of
-from cirl_marl.jobs.work import Job, JobFiles, Work, do
+from cirl_marl.jobs.work import Job, JobFiles, Work, do, last_line
 from cirl_marl.records.files import refuse_links
 
 JobState = Literal["waiting", "running", "elsewhere", "done", "failed"]
@@ -183,7 +183,7 @@ class _Driver:
             self._states[job.name] = "elsewhere"
         else:
             message = files.figures().get("said") or ": ".join(
-                filter(None, (state, files.last_words() or "it said nothing"))
+                filter(None, (state, last_line(files.log) or "it said nothing"))
             )
             self._settle(job, "failed", Failure(job.name, message, files.log))
 

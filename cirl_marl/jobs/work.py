@@ -104,10 +104,6 @@ class JobFiles:
             raise RunError(f"{self.progress_file}: is not what a job told: cpu_seconds is None")
         return content
 
-    def last_words(self) -> str:
-        """Return the last line of the log; empty if there is none."""
-        return last_line(self.log)
-
 
 @dataclass(frozen=True, slots=True)
 class Work:
