@@ -193,7 +193,7 @@ def sorting_loop(seed: int, mines: int, *, controlled: bool = False) -> Network:
         ends = {f"on_{i}_{j}": f"sorter_{j}" for j in range(count) if i != j} | {f"rejects_{i}": "waste"}
         for (id_, end), share, part in zip(ends.items(), shares, parts, strict=False):
             arc = Arc(id=id_, donor=f"sorter_{i}", recipient=end, law=Law.SHARE, share=share, transfer={"copper": part})
-            if controlled and id_ == "rejects_0":
+            if controlled and (id_ == "rejects_0" or rng.random() < 0.5):
                 control = Control(kind=ControlKind.TRANSFER, low=0.0, neutral=part, high=part, substances=("copper",))
                 arc = replace(arc, transfer={}, control=control)
             arcs.append(arc)
@@ -237,6 +237,57 @@ def test_loops_without_stock_purify_as_far_as_they_do(seed: int, mines: int, con
         replace(network, services=(limits[1],))
     drawn = {"arcs.rejects_0.transfer.copper": Spread(low=0.5, high=1.0, distribution="uniform")}
     assert replace(network, services=(limits[1],), uncertain=drawn)
+
+
+@given(seed=st.integers(0, 2**31), kind=st.sampled_from(["transfer", "share", "uncertain"]))
+@settings(max_examples=30)
+def test_loops_that_agents_or_draws_change_have_limits(seed: int, kind: str) -> None:
+    """The first sorter rejects parts p of copper and q of all else, and the second sends a share s back.
+
+    Copper passes that (1 − p)/(1 − (1 − p)·s) times, all else likewise, each as seldom or as often as shares allow;
+    where the first only enriches copper, nothing is purer than what passes it once.
+    """
+    rng = np.random.default_rng(seed)
+    content, part, other, back = rng.uniform(0.05, 0.9, 4)
+    copper = {"copper": float(part)}
+    control = Control(kind=ControlKind.TRANSFER, low=0.0, neutral=0.1 * part, high=part, substances=("copper",))
+    rejects = Arc(id="rejects", donor="first", recipient="waste", law=Law.SHARE, share=other, transfer=copper)
+    again = Arc(id="again", donor="second", recipient="first", law=Law.SHARE, share=back)
+    if kind == "transfer":
+        rejects = replace(rejects, transfer={}, control=control)
+    elif kind == "share":
+        again = replace(again, control=Control(kind=ControlKind.SHARE, low=0.0, neutral=0.0, high=back), share=None)
+    arcs = [
+        Arc(id="mined", donor="mine", recipient="first", rate=0.3),
+        *(rejects, Arc(id="on", donor="first", recipient="second", law=Law.SHARE)),
+        *(again, Arc(id="made", donor="second", recipient="use", law=Law.SHARE)),
+    ]
+    nodes = [Node(id="mine", initial=(9.0, 9.0), content={"copper": float(content)})]
+    nodes += [Node(id="use", initial=(0.0, 0.0)), Node(id="waste", initial=(0.0, 0.0), role=Role.LANDFILL)]
+    nodes += [Node(id=id_, stores=False) for id_ in ("first", "second")]
+    copper_alone, episode = (Substance(id="copper"),), Episode(horizon=2)
+    network = Network(name="two", nodes=tuple(nodes), arcs=tuple(arcs), substances=copper_alone, episode=episode)
+    if kind == "uncertain":  # of what is drawn B may send all back
+        network = replace(network, uncertain={"arcs.again.share": Spread(low=0.9, high=1.0, distribution="uniform")})
+    returns = {"transfer": (back, back), "share": (0.0, back), "uncertain": (0.0, 1.0)}[kind]
+    least = max(
+        (passed := content * (1 - part) / (1 - (1 - part) * few))
+        / (passed + (1 - content) * (1 - other) / (1 - (1 - other) * many))
+        for few, many in ((returns, (0.0, 0.0)) if part < other else (returns,))
+    )
+
+    env = MultiAgentVectorEnv(network, num_envs=2, uncertain=kind == "uncertain")
+    env.reset(seed=seed)
+    env.advance(np.tile([-1.0, 1.0], (len(env.actuators.control_rows), 1)))
+    made = network.arc_index["made"]
+    reached = env.physical.substances[made] / env.physical.flow[made]
+    assert (reached >= least * (1 - 1e-8)).all()
+    if kind == "transfer":
+        np.testing.assert_allclose(reached[1], least, rtol=1e-8)
+    limit = Service(id="pure", provider="made", quantity="flow", substance="copper", low=0.0, high=1.001 * least)
+    assert replace(network, services=(limit,))
+    with pytest.raises(NetworkError, match="of what is in 'made' is copper, whatever is done"):
+        replace(network, services=(replace(limit, high=0.999 * least),))
 
 
 def test_limits_and_contents_that_change_are_those_of_some_time() -> None:

@@ -14,7 +14,12 @@ from cirl_marl.network.substances import changing_sources, separates
 SETTLED, ROUNDS = 1e-12, 1000
 """Change of a range in a round that counts as none, and rounds after which what still changes may be anything."""
 ROUND_OFF = 1e-9
-"""By how much shares of a whole may miss it, as sums round."""
+"""By how much sums may round."""
+MANY, POLICIES = 64, 100
+"""Nodes of the largest loop whose visits are looked for, and policies that are tried; a handful is enough."""
+
+Ways = tuple[Integers, Integers, Floats]
+"""Arcs that enter loops, nodes that they lead past, and how often."""
 
 
 def reachable_contents(network: Any, starts: Floats, shares: Floats) -> tuple[Floats, Floats]:
@@ -22,7 +27,7 @@ def reachable_contents(network: Any, starts: Floats, shares: Floats) -> tuple[Fl
 
     Stocks begin with their content and mix what enters; what a node hands on in shares that differ by component has
     s_c·x_c of Σ s·x. The ranges are the least that contain ``starts`` and reproduce themselves. Where material goes
-    round past nodes without stock, in shares that never change, s_c is how often it passes a node in all.
+    round past nodes without stock, s_c may also be how often it passes a node in all; what both allow is left.
 
     Args:
         network: whose nodes mix and separate.
@@ -38,14 +43,28 @@ def reachable_contents(network: Any, starts: Floats, shares: Floats) -> tuple[Fl
     is_separate = np.zeros(len(network.arcs), dtype=bool)
     for split in network.splits:
         is_separate[[*split.controlled_arcs, *split.other_arcs]] = separates(network, split)
+    no_ways = np.empty(0, np.intp), np.empty(0, np.intp), shares[:, :, :0]
+    ranges = _settled_ranges(network, starts, shares, is_separate, no_ways)
+    ways = _loop_visits(network, shares, is_separate)
+    if len(ways[0]):
+        with_visits = _settled_ranges(network, starts, shares, is_separate, ways)
+        ranges = np.stack([np.maximum(ranges[0], with_visits[0]), np.minimum(ranges[1], with_visits[1])])
+    flows = _handed_on(ranges[:, :, network.donors], shares, is_separate)
+    stocks = ranges[:, :, : len(network.stores)].copy()
+    stocks[..., [network.node_index[source.id] for source in changing_sources(network)]] = [[[0.0]], [[1.0]]]
+    return stocks, flows
+
+
+def _settled_ranges(network: Any, starts: Floats, shares: Floats, is_separate: NDArray[np.bool_], ways: Ways) -> Floats:
+    """Return the ranges of nodes that reproduce themselves, shape (2, components, nodes); ``ways`` go past loops."""
     ranges = np.tile([[[1.0]], [[0.0]]], (1, starts.shape[1], len(network.nodes)))
     ranges[:, :, : len(network.stores)] = starts
-    entries, passed, visits = _loop_visits(network, shares)
+    entries, passed, visits = ways
     plain = np.flatnonzero(~np.isin(network.recipients, passed))
     ends = np.concatenate([network.recipients[plain], passed])
     for done in range(ROUNDS + len(network.nodes)):
         flows = _handed_on(ranges[:, :, network.donors], shares, is_separate)
-        looped = _handed_on(flows[:, :, entries], np.stack([visits, visits]), np.ones(len(entries), dtype=bool))
+        looped = _handed_on(flows[:, :, entries], visits, np.ones(len(entries), dtype=bool))
         wider, flows = ranges.copy(), np.concatenate([flows[:, :, plain], looped], axis=2)
         np.minimum.at(wider[0].T, ends, flows[0].T)
         np.maximum.at(wider[1].T, ends, flows[1].T)
@@ -57,44 +76,84 @@ def reachable_contents(network: Any, starts: Floats, shares: Floats) -> tuple[Fl
             ranges[0][:, changed], ranges[1][:, changed] = 0.0, 1.0
     changes = ranges[0] != ranges[1]
     margin = np.array([-1e-9, 1e-9])[:, None, None] * changes  # of rounding, and what was too little to have settled
-    ranges = (ranges + margin).clip(0.0, 1.0)
-    flows = _handed_on(ranges[:, :, network.donors], shares, is_separate)
-    stocks = ranges[:, :, : len(network.stores)].copy()
-    stocks[..., [network.node_index[source.id] for source in changing_sources(network)]] = [[[0.0]], [[1.0]]]
-    return stocks, flows
+    within: Floats = (ranges + margin).clip(0.0, 1.0)
+    return within
 
 
-def _loop_visits(network: Any, shares: Floats) -> tuple[Integers, Integers, Floats]:
+def _loop_visits(network: Any, shares: Floats, is_separate: NDArray[np.bool_]) -> Ways:
     """Return how often each component of what enters a loop of nodes without stock passes each of its nodes.
 
-    Only loops that separate, and of certain shares, are among them.
+    Only loops that separate are among them, of at most ``MANY`` nodes, past which nothing can go round for ever.
 
     Returns:
-        Arcs that enter, and nodes that are passed, shape (ways,) each, and visits, shape (components, ways).
+        Arcs that enter, and nodes that are passed, shape (ways,) each, and least and most visits, shape (2, components,
+        ways).
     """
-    stores, least = len(network.stores), shares[0]
-    totals = np.zeros((len(least), len(network.nodes)))
-    np.add.at(totals.T, network.donors, least.T)
-    # least shares sum to 1 only where they are all there is
-    inside = (abs(totals - 1.0) < ROUND_OFF).all(axis=0) & (np.arange(len(network.nodes)) >= stores)
-    is_within = inside[network.donors] & inside[network.recipients]
+    stores = len(network.stores)
+    is_within = (network.donors >= stores) & (network.recipients >= stores)
     graph = nx.DiGraph(zip(network.donors[is_within].tolist(), network.recipients[is_within].tolist(), strict=True))
-    ways: list[tuple[Integers, Integers, Floats]] = [(np.empty(0, np.intp), np.empty(0, np.intp), least[:, :0])]
+    ways: list[Ways] = [(np.empty(0, np.intp), np.empty(0, np.intp), shares[:, :, :0])]
     for loop in nx.strongly_connected_components(graph):
         nodes = np.array(sorted(loop), dtype=np.intp)
         leaves, comes = np.isin(network.donors, nodes), np.isin(network.recipients, nodes)
-        stays = leaves & comes
-        if (least[:, stays] == least[:1, stays]).all():
+        if len(nodes) > MANY or not is_separate[leaves & comes].any():
             continue  # to mix what has one content is exact
-        passes = np.zeros((len(least), len(nodes) ** 2))
-        givers, getters = (np.searchsorted(nodes, side[stays]) for side in (network.donors, network.recipients))
-        np.add.at(passes.T, givers * len(nodes) + getters, least[:, stays].T)
-        visits = np.linalg.inv(np.eye(len(nodes)) - passes.reshape(-1, len(nodes), len(nodes))).clip(0.0)
+        givers = np.searchsorted(nodes, network.donors[leaves])
+        getters = np.where(comes, np.searchsorted(nodes, network.recipients), len(nodes))[leaves]
+        visits = [
+            [_visits(part[:, leaves], givers, getters, len(nodes), side) for part in shares.swapaxes(0, 1)]
+            for side in (-1, 1)
+        ]
+        if not np.isfinite(visits).all():
+            continue
         arcs = np.flatnonzero(comes & ~leaves)
         starts = np.searchsorted(nodes, network.recipients[arcs])
-        ways.append((arcs.repeat(len(nodes)), np.tile(nodes, len(arcs)), visits[:, starts].reshape(len(least), -1)))
-    arcs, ends, visits = (np.concatenate(parts, axis=-1) for parts in zip(*ways, strict=True))
-    return arcs, ends, visits
+        totals = np.array(visits)[:, :, starts].reshape(2, len(shares[0]), -1)
+        ways.append((arcs.repeat(len(nodes)), np.tile(nodes, len(arcs)), totals))
+    arcs, ends, totals = (np.concatenate(parts, axis=-1) for parts in zip(*ways, strict=True))
+    return arcs, ends, totals
+
+
+def _visits(shares: Floats, givers: Integers, getters: Integers, count: int, side: int) -> Floats:
+    """Return the least (``side`` −1) or most (1) visits of each node, of what enters each, shape (entries, nodes).
+
+    They are the values of a Markov decision process, one for each node that is visited, found by policy iteration.
+
+    Args:
+        shares: least and greatest share of each arc that leaves a node, shape (2, arcs).
+        givers: the nodes that they leave, shape (arcs,).
+        getters: those that they enter, ``count`` for others.
+        count: number of nodes.
+        side: which visits.
+
+    References: Howard 1960.
+    """
+    (least, most), target, endless = shares, np.eye(count), np.full((count, count), np.inf)
+    remainder, values = np.ones(count), np.zeros((count, count + 1))
+    np.subtract.at(remainder, givers, least)
+    sorted_givers = np.sort(givers)
+    first, places = np.searchsorted(sorted_givers, sorted_givers), np.arange(count)[:, None]
+    for _ in range(POLICIES):
+        # each node's shares get their room in the order of what they bring: a fractional knapsack
+        order = np.lexsort((-side * values[:, getters], np.tile(givers, (count, 1))))
+        room = (most - least)[order]
+        before = np.cumsum(room, axis=1) - room
+        before -= before[:, first]
+        parts = least[order] + (remainder[sorted_givers] - before).clip(0.0, room)
+        policy = np.zeros((count, count, count + 1))
+        np.add.at(policy, (places, sorted_givers, getters[order]), parts)
+        try:
+            better = np.linalg.solve(target - policy[..., :count], target[..., None])[..., 0]
+        except np.linalg.LinAlgError:
+            return endless
+        if better.min() < -ROUND_OFF:
+            return endless
+        change = abs(better - values[:, :count]).max()
+        values[:, :count] = better
+        if change <= SETTLED * better.max():
+            visits: Floats = better.T.clip(0.0)
+            return visits
+    return endless
 
 
 def _handed_on(content: Floats, shares: Floats, is_separate: NDArray[np.bool_]) -> Floats:
