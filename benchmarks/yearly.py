@@ -64,7 +64,7 @@ SERVICE, MISSED = 0.95, 1e-4
 GAP = 0.01
 """Of the bound, within which a plan counts as close."""
 DEGREES = (2, 3, 4)
-"""Degrees of the test polynomials, tried in turn while there is time."""
+"""Degrees of the test polynomials, tried in turn while there is time; the first with constant parts (``tight``)."""
 ROUNDS, STALLED = 20, 5
 """Most linear programs of an improvement, and after how many of them it has to have got closer."""
 
@@ -163,7 +163,8 @@ def planned(seed: int, family: Family = RATES) -> Outcome:
         if degree > DEGREES[0] and seconds() > LIMIT / 2:  # the next bound takes longer than the last one did
             break
         try:
-            found = bound(network, min_service=SERVICE if network.services else None, degree=degree)
+            level = SERVICE if network.services else None
+            found = bound(network, min_service=level, degree=degree, tight=degree == DEGREES[0])
         except CirlError as missing:
             reason = str(missing)
             break

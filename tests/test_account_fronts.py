@@ -44,7 +44,6 @@ from cirl_marl.evaluation.account_front import AccountFront, _Sweep, _within_rea
 from cirl_marl.network.elements import Role
 from cirl_marl.optimum import bound, improve_plan, simulate_plan, supply_limits
 from cirl_marl.optimum.aims import Budget
-from cirl_marl.optimum.bounds import tight_bound
 from cirl_marl.optimum.supply_limits import _with_ends, with_supply_limits
 from cirl_marl.report import account_tables
 from cirl_marl.report.account_tables import front_table, write_account_front
@@ -343,7 +342,7 @@ def test_nothing_is_put_into_use_late_and_sold_early_in_each_year() -> None:
     free = bound("steel_japan", min_service=1.0)
     reached = float(simulate_plan(improve_plan(free)).episode_circularity[0])
     narrow = with_supply_limits(free, reached - 200.0)
-    tight = tight_bound(narrow, min_service=1.0, aim="circularity")
+    tight = bound(narrow, min_service=1.0, tight=True)
     assert tight.verify().bound == tight.objective
     assert 0.0 <= tight.objective - reached < 0.7
 

@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.special import gammainc, gammaincc
+from scipy.stats import poisson
 from test_lifetimes import INFLOW, LIVES, town
 
 from benchmarks.products import product_cycle
@@ -30,18 +31,17 @@ from cirl_marl import (
 )
 from cirl_marl.controllers import Constant, Neutral
 from cirl_marl.controllers.rollout import rollout
-from cirl_marl.network.elements import CIRCULARITY, Lifetime
-from cirl_marl.network.lifetimes import chain_of
+from cirl_marl.network.elements import Lifetime
+from cirl_marl.network.lifetimes import Chain, chain_of
 from cirl_marl.optimum import bound, envelope, improve_plan, simulate_plan
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.bounds import tight_bound
 from cirl_marl.optimum.kernels import Kernel
 from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.mpc import MPC
 from cirl_marl.optimum.options import by_stage
 from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.solver import solve
-from cirl_marl.optimum.stretched import CELL, _DiscardBounds, _survivors
+from cirl_marl.optimum.stretched import CELL, _DiscardBounds, _last_stage_bounds, _survivors
 from cirl_marl.optimum.vintages import Lifetimes
 
 Floats = NDArray[np.floating]
@@ -188,7 +188,8 @@ def test_rows_hold_however_a_lifetime_is_stretched(lifetime: Lifetime, style: st
     network = town(lifetime, inflow, initial=40.0, growth=0.02, stretch=changing, control=control)
     admissible = Admissible.of(network)
     programs, lifetimes = Programs(admissible, 2, None), admissible.lifetimes
-    layout, (whole,) = programs.layout, lifetimes.whole
+    (whole,) = lifetimes.whole
+    layout = programs.layout.with_constant_parts(np.empty(0, dtype=np.intp), lifetimes.exit_arcs)
     for turn in range(20):
         actions = rng.choice([-1.0, 1.0], years) if style == "ends" else rng.uniform(-1, 1, years)
         if style == "switch":  # the least first, then the most, or the other way round
@@ -202,12 +203,26 @@ def test_rows_hold_however_a_lifetime_is_stretched(lifetime: Lifetime, style: st
             for flow in layout.flow:
                 values[year, flow + whole.exit_arc] = outcome.flow[network.arc_index["discard"], 0]
                 values[year, flow + whole.inflow_arcs[0]] = inflow[year]
+            turnover = whole.rate[year] / (0.8 + 0.25 * (action + 1))
+            steady = layout.steady_column(whole.exit_arc)
+            values[year, steady] = least_outflow(whole.chain, turnover, whole.masses(starts[-1]), inflow[year])
             values[year, layout.end + network.node_index["use"]] = env.rows.stocks(env.physical.stock)[1, 0]
         for first in (0, 5):
             matrix, to = lifetimes.rows(layout, starts[first], range(first, years))
             assert (matrix @ values[first:].ravel() <= to + 1e-9 * to.max()).all()
         stretches = lifetimes.planned_stretches(layout, values, starts[0], range(years))["use"]
         np.testing.assert_allclose(stretches, 0.8 + 0.5 * (actions + 1) / 2, rtol=1e-6)
+
+
+def least_outflow(chain: Chain, turnover: float, masses: Floats, inflow: float) -> float:
+    """Return the least that leaves, beside what does at once, stages that pass on ``turnover`` times what they hold."""
+    matrix, state = np.zeros((chain.stages + 1,) * 2), np.append(masses, 1.0)
+    matrix[:-1, :-1] = chain.matrix / chain.rate * turnover
+    matrix[:-1, -1] = chain.inflow_shares * inflow
+    step, least = expm(matrix / 64), np.inf
+    for _ in range(65):
+        least, state = min(least, turnover * state[-2]), step @ state
+    return float(least)
 
 
 def test_what_leaves_a_stretched_life_is_enclosed_between_cells_too() -> None:
@@ -228,6 +243,12 @@ def test_what_leaves_a_stretched_life_is_enclosed_between_cells_too() -> None:
         left = survivors(masses, begin)
         assert low <= (left - survivors(masses, begin + least)).min() + 1e-14
         assert high >= (left - survivors(masses, begin + most)).max() - 1e-14
+        passed = np.arange(stages - 1, -1, -1)[:, None]
+        low, high = _last_stage_bounds(masses)(first, first + width)
+        in_last = masses @ poisson.pmf(passed, begin)
+        assert low <= in_last.min() + 1e-14 and high >= in_last.max() - 1e-14
+        around = masses @ poisson.pmf(passed, np.linspace(max(0.0, first - CELL), first + width + CELL, 200))
+        assert low >= around.min() * (1 - 1.1 * CELL) and high <= around.max() * (1 + 1.1 * CELL)
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
@@ -287,7 +308,7 @@ def test_no_episode_of_a_generated_cycle_exceeds_its_bound(seed: int) -> None:
     for copy in (circularity.argmax(), levels.sum(axis=1).argmax()):
         demand = levels[copy] * (1 - 1e-6)
         found = bound(network, min_service=demand, degree=1)
-        tight = tight_bound(network, min_service=demand, aim=CIRCULARITY)
+        tight = bound(network, min_service=demand, tight=True)
         assert circularity[copy] <= tight.objective + 1e-9 * abs(tight.objective)
         assert found.verify().bound == found.objective
         same = (levels >= levels[copy]).all(axis=1)
@@ -345,10 +366,48 @@ def test_what_leaves_beside_the_constant_part_may_fall_at_once() -> None:
         episode=Episode(horizon=3),
     )
     env = MultiAgentVectorEnv(network, num_envs=1)
-    most = tight_bound(network, min_service=0.0, aim=CIRCULARITY).objective
+    most = bound(network, min_service=0.0, tight=True).objective
     reached = [float(rollout(env, Constant({"recovery": action})).episode_circularity[0]) for action in (-1, 0, 1)]
     assert reached[0] < reached[1] < reached[2] == pytest.approx(most, rel=1e-3)
     assert reached[2] <= most + 1e-9 * abs(most)
+
+
+def test_shares_of_what_leaves_a_stretched_life_hardly_change_within_a_year() -> None:
+    """A share goes where much is needed all year, the rest where it is needed at the end: nobody serves both so well.
+
+    Without its constant part all that leaves in a year may do so at the end of it.
+    """
+    share = Control(kind=ControlKind.SHARE, low=0.0, neutral=0.5, high=1.0)
+    life = Lifetime(mean=20.0, deviation=6.0, distribution="normal")
+    stretch = Control(kind=ControlKind.STRETCH, low=0.9, neutral=1.0, high=1.25)
+    network = Network(
+        name="yard",
+        nodes=(
+            Node(id="use", lifetime=life, initial=(200.0, 200.0), control=stretch),
+            Node(id="sorting", stores=False),
+            Node(id="early", initial=(0.0, 0.0)),
+            Node(id="late", initial=(0.0, 0.0)),
+            Node(id="tip", role=Role.LANDFILL),
+        ),
+        arcs=(
+            Arc(id="old", donor="use", recipient="sorting", law=Law.SHARE),
+            Arc(id="to_early", donor="sorting", recipient="early", law=Law.SHARE, control=share),
+            Arc(id="to_late", donor="sorting", recipient="late", law=Law.SHARE),
+            Arc(id="early_end", donor="early", recipient="tip", rate=2.0),
+            Arc(id="late_end", donor="late", recipient="tip", rate=2.0),
+        ),
+        services=(
+            Service(id="sold", provider="to_early", quantity="flow", low=8.0),
+            Service(id="held", provider="late", quantity="stock", low=4.0),
+        ),
+        time_unit="year",
+        episode=Episode(horizon=4),
+    )
+    usual, most = (bound(network, aim={"sold": 1.0, "held": 1.0}, tight=tight) for tight in (False, True))
+    assert most.verify().bound == most.objective == pytest.approx(float(most.at()), rel=1e-9)
+    plans = [improve_plan(found) for found in (usual, most)]
+    reached = max(float(simulate_plan(plan).episode_levels[0].sum()) for plan in plans)
+    assert reached <= most.objective + 1e-9 and most.objective - reached < 0.5 * (usual.objective - reached)
 
 
 @pytest.mark.slow

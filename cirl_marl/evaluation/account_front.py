@@ -30,7 +30,6 @@ from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import CIRCULARITY
 from cirl_marl.optimum import Bound, bound, improve_plan, simulate_plan
 from cirl_marl.optimum.aims import aims_of
-from cirl_marl.optimum.bounds import tight_bound
 from cirl_marl.optimum.improve import shortage
 from cirl_marl.optimum.options import demanded_levels
 from cirl_marl.optimum.supply_limits import with_supply_limits
@@ -269,12 +268,12 @@ class _Sweep:
         aim = self.axes[0]
         if self._has_limits:
             try:
-                solution = tight_bound(self._programs, aim=aim, at_most=budgets, min_service=levels)
+                solution = bound(self._programs, aim=aim, at_most=budgets, min_service=levels, tight=True)
             except CirlError:
-                return tight_bound(self.definition, aim=aim, at_most=budgets, min_service=levels), False
+                return bound(self.definition, aim=aim, at_most=budgets, min_service=levels, tight=True), False
             if solution.objective >= self._least:
                 return solution, True
-        return tight_bound(self.definition, aim=aim, at_most=budgets, min_service=levels), False
+        return bound(self.definition, aim=aim, at_most=budgets, min_service=levels, tight=True), False
 
     def _place(self, axis: str) -> int:
         """Return the position of a service; 0 of what is none."""

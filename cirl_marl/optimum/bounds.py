@@ -72,6 +72,7 @@ class Bound:
     aims: Annotated[Aims, "what is weighed in place of λ̄, and budgets of accounts"]
     accounts: Annotated[Floats, "totals of the accounts under the plan, shape (accounts,)"]
     degree: Annotated[int, "degree of the test polynomials"]
+    tight: Annotated[bool, "whether flows that may vary have constant parts"]
     circularity: Annotated[Floats, "mean of λ over each interval under the plan, shape (steps,), mass"]
     stock: Annotated[Floats, "planned stocks at the start and after each interval, shape (steps + 1, stores), mass"]
     flow: Annotated[Floats, "planned mean flows, shape (steps, arcs), mass/time"]
@@ -165,7 +166,8 @@ class Envelope:
             check_service(min_service)
             demand = demanded_levels(first.network, min_service, np.shape(min_service)[:-1])
         shape = np.broadcast_shapes(starts.shape[:-1], () if demand is None else demand.shape[:-1])
-        programs = Programs(admissible, first.degree, first.service_weight, system=first.problem.system)
+        weight, system = first.service_weight, first.problem.system
+        programs = Programs(admissible, first.degree, weight, steady_parts=first.tight, system=system)
         starts = np.broadcast_to(starts, (*shape, len(first.initial)))
         levels = None if demand is None else np.broadcast_to(demand, (*shape, demand.shape[-1]))
         bounds = np.empty(shape)
@@ -188,6 +190,7 @@ def bound(
     scenario: str | None = None,
     horizon: int | None = None,
     degree: int = DEGREE,
+    tight: bool = False,
     near: Bound | None = None,
     uncertain: Literal[False] = False,
 ) -> Bound: ...
@@ -221,6 +224,7 @@ def bound(
     scenario: str | None = None,
     horizon: int | None = None,
     degree: int = DEGREE,
+    tight: bool = False,
     near: Bound | None = None,
     uncertain: bool | Sampling = False,
     progress: Callable[[float], None] = lambda share: None,
@@ -251,9 +255,11 @@ def bound(
         scenario: scenario of the definition; None is the default.
         horizon: decisions per episode; None takes the definition's.
         degree: degree of the test polynomials, 1 or more; higher is tighter and slower.
+        tight: whether flows that may vary within an interval, such as what leaves lifetimes, have constant parts, so
+            that shares of them cannot change: mostly tighter where there are lifetimes, and somewhat slower.
         near: a bound of a similar program, from whose solution this one is reached sooner: another start or level.
         uncertain: whether disturbances and uncertain numbers are drawn, and how if not by default; excludes
-            ``service_weight``, ``near`` and ``aim``.
+            ``service_weight``, ``near``, ``tight`` and ``aim``.
         progress: with ``uncertain``, which takes minutes, called with the share that is done.
 
     Raises:
@@ -267,8 +273,8 @@ def bound(
     if not isinstance(uncertain, bool | np.bool_ | Sampling):
         raise CirlError(f"uncertain must be True, False or a Sampling, got {uncertain!r}")
     if isinstance(uncertain, Sampling) or uncertain:
-        if service_weight is not None or near is not None or aim != CIRCULARITY:
-            options = "service_weight, near and aim"
+        if service_weight is not None or near is not None or tight or aim != CIRCULARITY:
+            options = "service_weight, near, tight and aim"
             raise CirlError(f"uncertain: {options} go with a certain future; demand min_service")
         levels = None if min_service is None else demanded_levels(definition, min_service)
         sampling, aims = uncertain if isinstance(uncertain, Sampling) else Sampling(), aims_of(definition, aim, at_most)
@@ -280,17 +286,8 @@ def bound(
     start = starting_stocks(admissible.lifetimes, initial)
     levels = None if min_service is None else demanded_levels(admissible.network, min_service)
     basis = None if near is None else near.basis
-    return _solve_bound(Programs(admissible, degree, service_weight), start, service_weight, levels, basis, aims)
-
-
-def tight_bound(
-    network: Network, *, min_service: ArrayLike, aim: Aim, at_most: Mapping[str, float] | None = None
-) -> Bound:
-    """Return ``bound`` by a program in which flows that may vary have constant parts: tighter, and slower."""
-    admissible = Admissible.of(network)
-    levels, aims = demanded_levels(network, min_service), aims_of(network, aim, at_most, with_services=True)
-    programs = Programs(admissible, DEGREE, None, steady_parts=True)
-    return _solve_bound(programs, starting_stocks(admissible.lifetimes, None), None, levels, None, aims)
+    programs = Programs(admissible, degree, service_weight, steady_parts=tight)
+    return _solve_bound(programs, start, service_weight, levels, basis, aims)
 
 
 def envelope(
@@ -403,6 +400,7 @@ def _solve_bound(
         aims=aims,
         accounts=accounts,
         degree=layout.degree,
+        tight=programs.steady_parts,
         circularity=circularity,
         stock=stock,
         flow=flow,

@@ -89,6 +89,7 @@ class Programs:
         admissible: ranges of the flows.
         layout: of the variables of an interval.
         system: which bounds the stocks.
+        steady_parts: whether what is constant of flows that may vary has variables.
     """
 
     def __init__(
@@ -125,7 +126,7 @@ class Programs:
             layout: of another program of the network, whatever its numbers; None: what its own ask for.
             cache: of programs of other numbers in the same network, with the same agents.
         """
-        self.admissible, lifetimes = admissible, admissible.lifetimes
+        self.admissible, self.steady_parts, lifetimes = admissible, steady_parts, admissible.lifetimes
         has_lifetimes = lifetimes.plan_network is not lifetimes.reach_network
         if system is None:
             chain_form = admissible

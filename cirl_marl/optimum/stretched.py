@@ -8,11 +8,17 @@ falls, so does what is left at the end of a piece lie between what is left with 
 
 and of what entered in an interval q what leaves in a later one p is at most the largest S(θ) − S(θ + μ v̄ h), and at
 least the smallest S(θ) − S(θ + μ v̲ h), for turnovers θ that are possible from the one to the other.
+
+When in p it leaves is free so far, so that shares of it may seem to change within p. But at any time v μ g(θ) leaves, g
+being what is in the last stage, beside the part w_0 that leaves as it enters: v̲ μ min g at least, and v̄ μ max g at
+most, over the θ of p. As no stage empties faster than by what it passes on, g e^θ never falls, which bounds g between
+the ends of cells. The least is the constant part of such a life (theorem 6).
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Callable
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -46,6 +52,7 @@ class StretchedRows:
         self._kernels = [Kernel(chain, each, layout.length, layout.degree) for each in by_piece]
         self._windows = _Windows(rate, factor, layout.network.episode.control_interval)
         self._low, self._high = _interval_bounds(chain, self._windows)
+        self._chain, self._rate = chain, rate * factor
 
     def matrix(self, stock: Any, outflow: Any, inflow: Any) -> Any:
         """Return the rows.
@@ -65,6 +72,36 @@ class StretchedRows:
             sparse.csr_array(self._low) @ entered - left,
         ]
         return sparse.vstack(rows, format="csr")
+
+    def outflow_bounds(self, inflow: Any, masses: Floats) -> tuple[tuple[Any, Floats], tuple[Any, Floats]]:
+        """Return what leaves at any time of each interval at least and at most, beside what leaves as it enters.
+
+        Args:
+            inflow: as in ``matrix``.
+            masses: in the stages at the start.
+
+        Returns:
+            Of each what it is of the variables, sparse, shape (steps, variables), and of what was there at the start.
+        """
+        windows, last = self._windows, _last_stage_bounds(masses)
+        span = zip(windows.before[0], windows.before[1] + windows.in_interval[1], strict=True)
+        of_start = self._rate * np.array([last(*ends) for ends in span]).T
+        portion = np.full((1, len(self._layout.moments)), self._layout.portion)
+        least, most = (sparse.kron(sparse.csr_array(part), portion) @ inflow for part in self._of_entered)
+        return (least, of_start[0]), (most, of_start[1])
+
+    @cached_property
+    def _of_entered(self) -> Floats:
+        """What leaves so in interval p of a unit of mass that enters in q, shape (2, steps, steps)."""
+        windows, last = self._windows, _last_stage_bounds(self._chain.inflow_shares)
+        bounds = np.zeros((2, self._steps, self._steps))
+        for p in range(self._steps):
+            turnover = float(windows.in_interval[1, p])
+            bounds[1, p, p] = last(0.0, turnover)[1]
+            for q in range(p):
+                shortest, longest = windows.between[:, p, q].tolist()
+                bounds[:, p, q] = last(shortest, longest + turnover)
+        return self._rate[:, :, None] * bounds
 
     def limits(self, masses: Floats) -> Floats:
         """Return the limits of the rows from masses in the stages."""
@@ -120,9 +157,25 @@ def _survivors(masses: Floats) -> Floats:
 @lru_cache(maxsize=4)
 def _survival(stages: int) -> Floats:
     """Return what is left at the ends of cells of what has ``stages`` to go, or fewer, shape (stages, ends)."""
-    turnover = np.arange(0.0, stages + TAIL * np.sqrt(stages) + 2 * TAIL, CELL)
-    left: Floats = special.gammaincc(np.arange(stages, 0, -1)[:, None], turnover)
+    left: Floats = special.gammaincc(np.arange(stages, 0, -1)[:, None], _cell_ends(stages))
     return left
+
+
+def _cell_ends(stages: int) -> Floats:
+    return np.arange(0.0, stages + TAIL * np.sqrt(stages) + 2 * TAIL, CELL)
+
+
+def _last_stage_bounds(masses: Floats) -> Callable[[float, float], tuple[float, float]]:
+    """Return what bounds how much of masses is in the last stage, by how often they may have turned over."""
+    passed, ends = np.arange(len(masses) - 1, -1, -1)[:, None], _cell_ends(len(masses))
+    in_last = np.append(masses @ np.exp(special.xlogy(passed, ends) - ends - special.gammaln(passed + 1)), 0.0)
+
+    def within(low: float, high: float) -> tuple[float, float]:
+        first = min(int(low / CELL), len(in_last) - 1)
+        at_ends = in_last[first : max(first, int(np.ceil(high / CELL))) + 1]
+        return float(at_ends.min()) * np.exp(-CELL) / WIDER, float(at_ends.max()) * np.exp(CELL) * WIDER
+
+    return within
 
 
 def _interval_bounds(chain: Chain, windows: _Windows) -> tuple[Floats, Floats]:

@@ -10,9 +10,9 @@ and their means under the test polynomials rise with i when divided by those of 
 what these held at the start of the interval is allowed for (theorem 3). What may fall otherwise is allowed for as it
 flows: by schedule from a stock that is refilled, out of lifetimes with fast stages, or through lifetimes at once.
 
-Of such flows, and of all that leaves lifetimes that nobody stretches, A may have a part a_k too, at most what flows at
-any time of the interval (``partly_steady``). An order from a refilled stock is all of it, unless it may be cut; of what
-entered a lifetime, and of what was there, the least that leaves in any moment.
+Of such flows, and of all that leaves lifetimes, A may have a part a_k too, at most what flows at any time of the
+interval (``partly_steady``). An order from a refilled stock is all of it, unless it may be cut; of what entered a
+lifetime, and of what was there, the least that leaves in any moment, or of one that is stretched at any time.
 """
 
 from __future__ import annotations
@@ -86,16 +86,15 @@ class Transit:
         nodes = np.arange(len(network.nodes))
         chains = [lifetime for lifetime in whole if len(lifetime.rate)]
         exits = np.array([chain.exit_arc for chain in chains], dtype=np.intp)
-        is_steady = np.array([steady_parts and not chain.factor.size for chain in chains], dtype=bool)
         varying_orders = np.flatnonzero(refilled & ~self.constant)
-        self.partly_steady = np.union1d(exits[is_steady], varying_orders if steady_parts else []).astype(np.intp)
+        self.partly_steady = np.union1d(exits, varying_orders) if steady_parts else np.zeros(0, dtype=np.intp)
         constant_recipients = network.recipients[self.constant | np.isin(arcs, self.partly_steady)]
         entered = np.isin(nodes, constant_recipients) & (nodes >= stores)
         leads = self._spread(np.isin(nodes, self.splits), nodes >= stores, against=True)
         self.nodes = np.flatnonzero(self._spread(entered, nodes >= stores) & leads)
         self.arcs = np.flatnonzero(np.isin(network.donors, self.nodes))
         self.lives = network.donors[exits]
-        whole_flow = [chain for chain, steady in zip(chains, is_steady.tolist(), strict=True) if not steady]
+        whole_flow = [] if steady_parts else chains
         at_once = [(k, life.exit_arc, life.chain.weights[0]) for life in whole_flow for k in life.inflow_arcs.tolist()]
         # flows that may fall by themselves: which, where a part of it enters, and the part
         varies = [(arc, arc, 1.0) for arc in varying_orders.tolist()]

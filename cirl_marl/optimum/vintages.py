@@ -217,21 +217,29 @@ class Lifetimes:
         for lifetime in self.whole:
             outflow = _column_sums(first + lifetime.exit_arc, width)
             inflow = _column_sums(first + lifetime.inflow_arcs, width)
+            if has_steady := len(lifetime.rate) > 0 and lifetime.exit_arc in layout.steady_arcs:
+                column = np.arange(len(intervals))[:, None] * layout.size + layout.steady_column(lifetime.exit_arc)
+                steady = _column_sums(column, width)
             if lifetime.factor.size:
                 stretch, node = self._stretch_rows(lifetime, layout, intervals), lifetime.node.id
                 stock = _column_sums(ends + self.plan_network.node_index[node], width)
                 blocks.append(stretch.matrix(stock, outflow, inflow))
                 limits.append(stretch.limits(lifetime.masses(initial)))
+                if has_steady:
+                    (least, least_start), (most, most_start) = stretch.outflow_bounds(inflow, lifetime.masses(initial))
+                    by_moment = sparse.kron(sparse.eye_array(len(intervals)), np.ones((len(layout.moments), 1)))
+                    later = outflow - lifetime.chain.weights[0] * inflow
+                    blocks += [least - steady, by_moment @ steady - later, later - by_moment @ most]
+                    limits += [-least_start, np.zeros(len(first)), by_moment @ most_start]
                 continue
             # L − c̄ U ≤ from_start and c̲ U − L ≤ −from_start, in the columns of what leaves and of what enters
             write = self._chain_kernels if len(lifetime.rate) else self._line_kernels
             low, high, from_start = write(lifetime, layout, initial, intervals)
             blocks += [outflow - high @ inflow, low @ inflow - outflow]
             limits += [from_start, -from_start]
-            if len(lifetime.rate) and lifetime.exit_arc in layout.steady_arcs:
-                steady = np.arange(len(intervals))[:, None] * layout.size + layout.steady_column(lifetime.exit_arc)
+            if has_steady:
                 least = low.toarray().reshape(len(intervals), -1, low.shape[1]).min(axis=1)
-                blocks.append(sparse.csr_array(least) @ inflow - _column_sums(steady, width))
+                blocks.append(sparse.csr_array(least) @ inflow - steady)
                 limits.append(-from_start.reshape(len(intervals), -1).min(axis=1))
             if self._bounds_stock(lifetime, layout):
                 stock = _column_sums(ends + self.plan_network.node_index[lifetime.node.id], width)
