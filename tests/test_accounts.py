@@ -248,6 +248,7 @@ def test_what_cannot_be_asked_for_is_told() -> None:
         ({"aim": "cost", "at_most": {"cost": 1.0}}, "kept as low as can be already"),
         ({"aim": "cost", "service_weight": 1.0}, "service_weight goes with"),
         ({"aim": "cost", "uncertain": True}, "go with a certain future"),
+        ({"tight": True, "uncertain": True}, "tight and aim go with a certain future"),
         ({"aim": {"cost": 1.0, "cots": 2.0}}, "unknown account.* 'cots'.*Did you mean 'cost'"),
         ({"aim": {"cost": float("inf")}}, "the weight of 'cost' must be a finite number"),
         ({"aim": {"circularity": -1.0, "cost": 1.0}}, "the weight of 'circularity' must not be negative"),
