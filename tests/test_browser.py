@@ -148,6 +148,8 @@ def test_colours_show_contents(tmp_path: Path, opened: Any) -> None:
     page = opened(write_page(tmp_path / "steel.html", page_of_alternatives(simulations))).page
     colours = "all => all.map(e => getComputedStyle(e).stroke)"
     own = page.eval_on_selector_all(".ribbon .line", colours)
+    (rejects,) = page.locator("figcaption", has_text="share of copper in shredder").all()
+    assert rejects.inner_text().endswith("\n30.0\u00a0%")
     page.select_option("#tint", "copper")
     assert len(set(page.eval_on_selector_all(".ribbon .line", colours))) > len(set(own))
     steps = page.locator("#legend li").all_text_contents()

@@ -89,6 +89,7 @@ def test_the_command_colours_by_a_substance(tmp_path: Path) -> None:
     """One that is there; another one is told with the nearest."""
     arguments = ["show", EXAMPLE, "--picture", str(tmp_path / "steel.png"), "--substance"]
     plain = CliRunner().invoke(app, [*arguments[:-1]])
+    assert "flow of flat_made at least 20 Mt/year" in plain.output and "flat_made at most 0.1 %" in plain.output
     before = (tmp_path / "steel.png").read_bytes()
     result = CliRunner().invoke(app, [*arguments, "copper"])
     assert plain.exit_code == result.exit_code == 0, result.output

@@ -99,7 +99,7 @@ def show(
     from cirl_marl.drawing.digraph import save_network
     from cirl_marl.drawing.folding import fold_copies
     from cirl_marl.environments.vector import MultiAgentVectorEnv
-    from cirl_marl.network.series import Series, extremes
+    from cirl_marl.network.series import Series, extremes, product
     from cirl_marl.report.terminal import arcs_table, disturbances_table, nodes_table
 
     definition = load_network(network, scenario=scenario)
@@ -113,9 +113,12 @@ def show(
     folded_view = fold_copies(definition, stock, flow, unfold or ())
     common.console.print(nodes_table(folded_view[0], folded_view[1]))
     common.console.print(arcs_table(folded_view[0], folded_view[2]))
+    mass, flows = f" {definition.mass_unit}", f" {definition.mass_unit}/{definition.time_unit}"
+    units = {"stock": mass, "outflow": flows, "flow": flows, "measure": ""}
     for service in definition.services:
-        ends = [f"at least {service.low:g}"] if extremes(service.low)[1] > 0 else []
-        ends += [] if np.isinf(extremes(service.high)[0]) else [f"at most {service.high:g}"]
+        scale, unit = (100.0, " %") if service.substance else (1.0, units[service.quantity])
+        ends = [f"at least {product(service.low, scale):g}{unit}"] if extremes(service.low)[1] > 0 else []
+        ends += [] if np.isinf(extremes(service.high)[0]) else [f"at most {product(service.high, scale):g}{unit}"]
         variation = ", changing in time" if isinstance(service.low, Series) or isinstance(service.high, Series) else ""
         subject = f"{service.subject} of {' and '.join(service.providers)}"
         common.console.print(f"service '{service.id}': {subject} {' and '.join(ends)}{variation}")

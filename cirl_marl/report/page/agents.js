@@ -37,7 +37,7 @@ export function agentsOf(story, network, go) {
 }
 
 function panel(story, setting, scenes, go) {
-  const share = setting.kind === "share";
+  const share = ["share", "transfer"].includes(setting.kind);
   const flat = (bound) => (Array.isArray(bound) ? bound : [bound]).filter((value) => value !== null);
   const unit = setting.unit === "1" ? "" : setting.unit;
   const lines = scenes.map((scene) => ({ name: scene.name, ink: scene.ink, value: scene.controls[setting.row] }));
