@@ -319,6 +319,7 @@ def test_points_worse_than_others_are_bounded_without_limits_of_supplies() -> No
     np.testing.assert_array_equal(sweep._carried_out(dry).flow, simulate_plan(improve_plan(solved)).flow)
 
 
+@pytest.mark.slow
 def test_good_episodes_stay_what_they_are_under_limits() -> None:
     """Whatever agents do: an episode at least as good as was asked for is the same in the narrower network."""
     network = two_sources()
@@ -354,6 +355,7 @@ def middle_episode(network: Network, action: float) -> Rollout:
     return origin.play(env, Constant({"import": action}))
 
 
+@pytest.mark.slow
 def test_nothing_is_limited_where_nothing_is_proved(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of episodes however bad, of supplies that are alike or may run dry, and of programs that are too large."""
     network = two_sources()
@@ -450,8 +452,7 @@ def corner() -> Network:
 
 
 @pytest.mark.parametrize("min_service", [0.95, 0.99])
-@pytest.mark.medium
-@pytest.mark.sample(1)
+@pytest.mark.slow
 def test_limits_of_supplies_prove_nothing_of_worse_episodes(min_service: float) -> None:
     """Without recycling and reuse both are cheapest, though no episode of limited supplies can be like that."""
     network, shares = corner(), list[float]()

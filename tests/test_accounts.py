@@ -505,6 +505,7 @@ def test_pictures_show_who_books_what_and_the_total(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.parametrize("amount", AMOUNTS, ids=lambda amount: f"{amount.network} {amount.account}")
+@pytest.mark.sample(2)
 def test_amounts_of_the_first_year_are_near_those_reported(amount: Amount) -> None:
     """Within 11 %: what is published is of other years, of steel for iron in it, or with rolling.
 

@@ -113,6 +113,7 @@ def test_tables_of_worlds_are_those_of_kept_results(benchmark: ModuleType, name:
     assert len(rows) > 2 and "\n".join(rows) in benchmark.DOCUMENT.read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_bounds_of_worlds_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With all that gaps and the price policy need; of another question there is none."""
     world, sampling = uncertain.World("works", "", ()), Sampling(draws=10, fit_draws=4, numbers=False)

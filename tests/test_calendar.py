@@ -117,6 +117,7 @@ def rows(path: Path, columns: Sequence[str]) -> list[list[str]]:
         ("day", "2020-02-28", "date", ["2020-02-28", "2020-02-29", "2020-03-01", "2020-03-02", "2020-03-03"]),
     ],
 )
+@pytest.mark.sample(1)
 def test_tables_have_years_or_dates(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, unit: str, start: str, header: str, dates: list[str]
 ) -> None:

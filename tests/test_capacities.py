@@ -140,6 +140,7 @@ def test_least_cost_of_two_technologies_is_that_of_a_program_by_hand(available: 
 
 
 @pytest.mark.parametrize(("horizon", "regret"), [(None, 0.0), (5, 0.0), (2, 0.0014)])
+@pytest.mark.sample(1)
 def test_who_sees_a_window_pays_little_more(horizon: int | None, regret: float) -> None:
     """What a window leaves is priced by the plan of the episode, so that its cost is close to that of foresight."""
     env = MultiAgentVectorEnv(power(), num_envs=1)

@@ -425,7 +425,7 @@ def test_uncertain_bounds_of_disturbed_contents() -> None:
 
 
 @pytest.mark.parametrize("futures", [None, 2])
-@pytest.mark.sample(1)
+@pytest.mark.slow
 def test_mpc_plans_for_disturbed_contents_as_expected(futures: int | None) -> None:
     """From stocks with whatever is in them: both services come out better than as usual, in every copy."""
     means = []

@@ -328,9 +328,8 @@ def idle_network() -> Network:
     )
 
 
-@pytest.mark.medium
-@pytest.mark.sample(1)
 @pytest.mark.parametrize("step", ["0.125", "0.25"])
+@pytest.mark.slow
 def test_check_remarks_on_steps_that_are_too_long(
     step: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -386,7 +386,7 @@ def test_mpc_follows_a_plan_that_sorts() -> None:
 
 
 @pytest.mark.parametrize("horizon", [2, None])
-@pytest.mark.sample(1)
+@pytest.mark.slow
 def test_mpc_keeps_least_contents_and_those_of_stocks(horizon: int | None) -> None:
     """A product that must have copper takes scrap for it; what is in use counts by its stock."""
     run = controlled_by_mpc(sorter(low=0.03), horizon, 1.0)

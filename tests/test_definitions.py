@@ -414,6 +414,7 @@ def test_a_compartment_may_be_called_source(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "scenario"), [(name, each) for name in ONE_OF_EACH for each in scenarios(name)])
+@pytest.mark.sample(14)
 def test_what_is_written_reads_back(name: str, scenario: str, tmp_path: Path) -> None:
     """Every network of the catalogue, to the last bit, as the default scenario of its own file; without a title too."""
     network = load_network(name, scenario=scenario)

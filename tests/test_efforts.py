@@ -313,6 +313,7 @@ class _Constant(Neutral):
         return {agent: np.full((len(each), 1), 0.5) for agent, each in observations.items()}
 
 
+@pytest.mark.slow
 def test_expected_efforts_have_budgets() -> None:
     """Who may change little earns less in expectation; nobody who keeps it earns more than is proved."""
     disturbances = {"wage": Markov(values=(0.5, 1.5), matrix=((0.5, 0.5), (0.5, 0.5)))}

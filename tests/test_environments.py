@@ -84,6 +84,7 @@ def test_pettingzoos_own_tests(name: str, scenario: str, capsys: pytest.CaptureF
 
 @marked
 @anything
+@pytest.mark.sample(15)
 def test_gymnasium_and_sb3_checkers(name: str, scenario: str) -> None:
     """The one-agent view, under both checkers."""
     from gymnasium.utils.env_checker import check_env as gymnasium_check
@@ -228,8 +229,9 @@ def test_copies_restart_by_themselves() -> None:
                 np.testing.assert_array_equal(observations[agent], again[agent])
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize("name", ONE_OF_EACH)
+@pytest.mark.medium
+@pytest.mark.sample(3)
 def test_others_hold_their_neutral_control(name: str) -> None:
     """A one-agent environment is the whole network with everyone else neutral."""
     agent = load_network(name).agents[-1]
@@ -250,9 +252,8 @@ def can_stop(name: str) -> bool:
     return not any(arc.makes_up_for for arc in load_network(name).arcs)
 
 
-@pytest.mark.medium
-@pytest.mark.sample(1)
 @pytest.mark.parametrize("name", [*filter(can_stop, ONE_OF_EACH)])
+@pytest.mark.slow
 def test_zero_throughput_is_not_best(name: str) -> None:
     """Stopping everything is good for λ, but the service fails and the mixed reward falls.
 

@@ -125,7 +125,7 @@ def stop_at(monkeypatch: pytest.MonkeyPatch, steps: list[int], *, saved: bool) -
     monkeypatch.setattr(module, "_keep", keep)
 
 
-@pytest.mark.sample(4)
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("saved", [True, False], ids=["saved", "killed"])
 @pytest.mark.parametrize("case", CASES)
 def test_the_same_bits(case: str, saved: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -34,8 +34,8 @@ def halfway_in_years(network: Network, level: float) -> float:
     return float(np.mean([run.accounts[0, 1] for run in ends]))
 
 
-@pytest.mark.sample(1)
 @pytest.mark.parametrize(("level", "futures"), [(0.9, None), (0.8, 2)])
+@pytest.mark.slow
 def test_budgets_of_disturbed_episodes_hold_in_expectation(level: float, futures: int | None) -> None:
     """The mean of 24 paths comes within 4 % of the budget; single ones do not have to."""
     network = with_random_demand(0.3)

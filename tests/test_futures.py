@@ -53,10 +53,9 @@ def assert_alike(future: Future, programs: Programs, stock: np.ndarray, interval
         np.testing.assert_allclose(getattr(own, name), values, rtol=1e-5, atol=1e-9 * np.abs(values).max())
 
 
-@pytest.mark.medium
-@pytest.mark.sample(1)
 @pytest.mark.parametrize(("network", "scenario"), WORLDS)
 @pytest.mark.parametrize("count", [None, 2])
+@pytest.mark.slow
 def test_programs_are_those_of_each_copy_alone(network: str, scenario: str, count: int | None) -> None:
     """Rows, right-hand sides and boxes, with whatever is kept from other copies and decisions."""
     env = under_way(network, scenario, 3, 2)

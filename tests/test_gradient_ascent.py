@@ -42,6 +42,7 @@ def recipe(run: dict[str, Any] | None = None, **learner: Any) -> Recipe:
     ("share", "budgets", "algorithm"),
     [(1.0, {}, "PPO"), (0.5, {"emissions": -50.0, "cost": 20.0}, "PPO"), *((1.0, {}, name) for name in SQUASHED)],
 )
+@pytest.mark.sample(2)
 def test_gradients_go_through_the_policies(
     monkeypatch: pytest.MonkeyPatch, share: float, budgets: dict[str, float], algorithm: str
 ) -> None:

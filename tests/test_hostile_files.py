@@ -148,6 +148,7 @@ def unfinished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @COUNTS
+@pytest.mark.slow
 def test_runs(count: int, unfinished: Path, tmp_path: Path) -> None:
     """An unfinished one, its checkpoints and journals among it, is read, gone on with, evaluated and exported."""
     uses: dict[str, Use] = {

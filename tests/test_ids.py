@@ -92,7 +92,6 @@ def test_an_old_version_names_its_successor(planted: None, monkeypatch: pytest.M
         gymnasium.registry.pop("cirl_marl/copper_net.paper-v0", None)
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize(
     "code",
     [
@@ -101,6 +100,8 @@ def test_an_old_version_names_its_successor(planted: None, monkeypatch: pytest.M
         "gymnasium.make_vec('cirl_marl:cirl_marl/CopperNet-v0', num_envs=2)",
     ],
 )
+@pytest.mark.medium
+@pytest.mark.sample(1)
 def test_gymnasium_knows_them_whoever_comes_first(code: str, tmp_path: Path) -> None:
     """In a checkout that is not installed, in either order of imports."""
     command = [sys.executable, "-W", "error", "-c", f"import sys; sys.path.insert(0, {str(ROOT)!r}); {code}.close()"]

@@ -154,6 +154,7 @@ BUILDERS = {"pint", "scipy.integrate", "scipy.optimize", "gymnasium_robotics"}
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
+@pytest.mark.sample(2)
 def test_what_a_start_does_not_load(arguments: list[str], absent: set[str]) -> None:
     """Commands load what they need: seconds would depend on the machine, modules do not."""
     done = subprocess.run(

@@ -115,10 +115,10 @@ def test_random_batch_equals_lone(network: Network, seed: int, reward: str) -> N
     assert_batch_is_lone(network, seed, reward)
 
 
-@pytest.mark.medium
-@pytest.mark.sample(30)
+@pytest.mark.sample(15)
 @pytest.mark.parametrize("reward", REWARDS)
 @anything
+@pytest.mark.medium
 def test_catalogue_batch_equals_lone(name: str, scenario: str, reward: str) -> None:
     """Same seed, same bits; a copy of a batch equals a lone environment, and all views agree."""
     network = load_network(name, scenario=scenario).with_options(episode={"horizon": 5})
@@ -126,6 +126,7 @@ def test_catalogue_batch_equals_lone(name: str, scenario: str, reward: str) -> N
 
 
 @anything
+@pytest.mark.sample(15)
 def test_single_equals_parallel(name: str, scenario: str) -> None:
     """One agent under Gymnasium is the same agent under PettingZoo, bit for bit."""
     network = load_network(name, scenario=scenario).with_options(episode={"horizon": 6})

@@ -136,7 +136,7 @@ def test_hipo_proves_the_bound_that_the_others_prove(monkeypatch: pytest.MonkeyP
     assert found.verify().bound == pytest.approx(usual.objective, rel=solver.NEAR)
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_an_outlook_of_a_large_network_is_solved_once_and_roughly(monkeypatch: pytest.MonkeyPatch) -> None:
     """HiPO stops there at half a percent; windows serve and come as near the bound as after a good outlook."""
     pytest.importorskip("highspy_extras")

@@ -144,7 +144,7 @@ def _families(count: int, layout: Layout, steps: int) -> list[NDArray[np.intp]]:
     return [np.arange(a, b).reshape(steps, -1) for a, b in pairwise(ends)]
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("stretch", [1.0, Series(times=(0.0, 3.0), values=(0.8, 1.4))])
 @pytest.mark.parametrize("lifetime", [LIVES[0], LIVES[2], Lifetime(mean=0.6, deviation=0.3, distribution="weibull")])
 def test_rows_and_boxes_hold_in_an_episode(lifetime: Lifetime, stretch: float | Series) -> None:
@@ -176,7 +176,7 @@ def test_rows_and_boxes_hold_in_an_episode(lifetime: Lifetime, stretch: float | 
     assert room < 1e-2 * left.max()
 
 
-@pytest.mark.sample(4)
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("style", ["ends", "inside", "switch"])
 @pytest.mark.parametrize("lifetime", [LIVES[0], LIVES[2], Lifetime(mean=12.0, deviation=3.0, distribution="lognormal")])
 def test_rows_hold_however_a_lifetime_is_stretched(lifetime: Lifetime, style: str) -> None:

@@ -196,6 +196,7 @@ def exact_day(network: Network, state: Floats) -> Floats:
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
+@pytest.mark.sample(1)
 def test_against_scipy(scenario: str) -> None:
     """A day of jumping controls at the definition's step: what moved to 1e-5 kg, of 3 and 2 to 6 kg.
 
@@ -247,6 +248,7 @@ def test_dilution_raises_emission_and_methane() -> None:
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
+@pytest.mark.slow
 def test_dilution_trades_methane_for_emission(scenario: str) -> None:
     """Less dilution: less emission and higher λ̄, and the methane service fails."""
     runs = episodes(scenario)

@@ -40,6 +40,7 @@ SHIPPED = Network(
 @pytest.mark.parametrize("circularity", ["end", "mean"])
 @given(network=st.from_type(Network), seed=st.integers(0, 1000))
 @example(network=SHIPPED, seed=0)
+@pytest.mark.sample(1)
 def test_who_is_neutral_makes_no_difference(circularity: str, network: Network, seed: int) -> None:
     """D = λ − λ had the agent been neutral is 0 for whoever is, whatever the others do and has been shipped before."""
     env = MultiAgentVectorEnv(network, num_envs=2, reward="difference", circularity=circularity)

@@ -111,9 +111,8 @@ def cirl(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     return int(ended.value.code or 0)
 
 
-@pytest.mark.medium
-@pytest.mark.sample(1)
 @pytest.mark.parametrize(("algorithm", "steps", "done"), [("A2C", 300, 300), ("ARS", 300, 800), ("DDPG", 150, 150)])
+@pytest.mark.slow
 def test_row_is_trained_kept_and_not_run_again(
     algorithm: str,
     steps: int,

@@ -81,6 +81,7 @@ def test_trainings_are_kept(bottles: Network, tmp_path: Path) -> None:
         swept(bottles, tmp_path)
 
 
+@pytest.mark.slow
 def test_swept_weights_stay_as_they_are(bottles: Network, tmp_path: Path) -> None:
     """Also by a recipe that moves the price of service for what it demands; the best checkpoint is paid most."""
     given = load_recipe("independent_a2c")

@@ -179,7 +179,7 @@ def market() -> Network:
     return replace(network, nodes=parts["nodes"], arcs=parts["arcs"], accounts=ACCOUNTS, time_unit="year")
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_plans_climb_to_the_optimum_from_anywhere() -> None:
     """Steps know that rates rise of what flows, is held and is changed; MPC of a window does no worse than 1 %."""
     network = market()

@@ -88,8 +88,8 @@ def yearly(residence: float = 0.25, horizon: int = 12, shortest: float = 1.0) ->
     )
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize("residence", [0.5, 0.1])
+@pytest.mark.slow
 def test_residence_times_of_a_fraction_of_a_step(residence: float) -> None:
     """The certificate closes, and a plan comes within a percent of the bound at the demanded service."""
     found = bound(yearly(residence), min_service=0.97)

@@ -165,7 +165,7 @@ def test_plans_solve_pooling_problems(name: str) -> None:
     assert (run.accounts[0, 1:] <= most * (1 + 1e-5)).all()
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_mpc_is_no_worse_than_the_plan_that_it_could_follow() -> None:
     """Also beside budgets, where the optimum of the program alone leads to 400 of 600."""
     problem = PROBLEMS["Haverly 2"]
@@ -177,6 +177,7 @@ def test_mpc_is_no_worse_than_the_plan_that_it_could_follow() -> None:
     assert (run.accounts[0, 1:] <= np.array([*budgets.values()]) * (1 + 1e-5)).all()
 
 
+@pytest.mark.slow
 def test_a_leap_that_fails_is_not_made_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is too impure goes at once or not at all; then its price rises."""
     leaps, make, values = list[float](), linearised.step_program, solver.best_values

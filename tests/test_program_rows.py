@@ -402,7 +402,7 @@ MIXED = {"free": -1.0, "supply": 1.0, "demand": -1.0, "store": 1.0, "mining": -1
 """One order at its most, another at its least, and a cut that is shared by both."""
 
 
-@pytest.mark.sample(12)
+@pytest.mark.sample(4)
 @pytest.mark.parametrize("style", ["inside", "ends", "low", "high", "draining", "mixed"])
 @pytest.mark.parametrize("valve", [None, (0.3, 1.4), (0.0, 1.0)])
 @pytest.mark.parametrize(("stock", "asked"), [(12.0, 60.0), (0.0, 60.0), (700.0, 5.0)])

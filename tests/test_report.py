@@ -84,7 +84,7 @@ def _settings_untouched() -> Iterator[None]:
     assert pyplot is None or not pyplot.get_fignums()
 
 
-@pytest.mark.sample(4)
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("name", ONE_OF_EACH)
 def test_catalogue_is_readable(name: str) -> None:
     """No box or label hides another; but for networks of more than twenty arcs no arrow passes behind a box."""

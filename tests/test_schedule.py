@@ -36,6 +36,7 @@ def test_neutral_plan_holds_the_neutral_controls() -> None:
 
 
 @pytest.mark.parametrize("demand", [None, 0.9])
+@pytest.mark.sample(1)
 def test_a_plan_says_what_bounds_it(demand: float | None) -> None:
     """The λ̄ that it names is a bound for the service of the plan, above the plan by the gap that it names."""
     network = load_network("copper_net").with_options(episode={"horizon": 6})

@@ -9,7 +9,7 @@ import cirl_marl
 from cirl_marl import MultiAgentVectorEnv
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_schedules_climb_towards_the_bound() -> None:
     """Of a start that is known, most of the way to what is possible; the environment stays where it is."""
     env = MultiAgentVectorEnv("carbo_net", num_envs=1, horizon=24)

@@ -43,9 +43,9 @@ def test_plan_achieves_what_it_says_and_no_less_than_its_candidates(name: str, s
     assert "no certificate" in str(found)
 
 
-@pytest.mark.medium
 @pytest.mark.sample(1)
 @pytest.mark.parametrize(("name", "gap"), [("copper_net", 0.1), ("carbo_net", 0.02)])
+@pytest.mark.medium
 def test_comes_close_to_the_bound(name: str, gap: float) -> None:
     """Ten days: where there is a bound the plan stays below it, and not far."""
     proved = bound(name, service_weight=2.0, horizon=40)

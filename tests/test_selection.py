@@ -67,6 +67,7 @@ def numbers(policy: Policy) -> np.ndarray:
     ],
     ids=["the first serves", "the mean serves", "nothing serves"],
 )
+@pytest.mark.sample(1)
 def test_policies_near_the_last_serve_just_enough(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, first: float, mean: float, rest: list[float]
 ) -> None:
@@ -206,6 +207,7 @@ def test_the_best_survives_a_resumption(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("best", [3, {"checkpoint": 4, "joint_steps": 1, "figures": {}}, {"checkpoint": "x"}])
+@pytest.mark.sample(1)
 def test_a_status_of_something_else_is_refused(tmp_path: Path, best: object) -> None:
     """And one from before there was a best is read."""
     run = learnt(tmp_path / "run", recipe(evaluations=0))

@@ -79,6 +79,7 @@ def refused(folder: Path, text: str) -> str:
         (CONSTANT, "", 10.0),
     ],
 )
+@pytest.mark.sample(4)
 def test_forms_of_a_flow(tmp_path: Path, flow: str, start: str, expected: Series | float | str) -> None:
     """In the file's units, on a clock of its own or on the calendar, in the file or in one beside it."""
     text = definition(flow, start=start)

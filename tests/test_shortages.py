@@ -189,6 +189,7 @@ def test_an_exponential_lifetime_lacks_what_a_rate_lacks() -> None:
 
 
 @pytest.mark.parametrize("distribution", ["normal", "weibull", "lognormal"])
+@pytest.mark.sample(1)
 def test_a_flood_that_dies_out_at_once_is_allowed_for(distribution: str) -> None:
     """Much that comes in one year dies together; what then lacks is below L, and more than without the flood."""
     use = {"lifetime": Lifetime(mean=LIFE, deviation=0.25 * LIFE, distribution=distribution)}

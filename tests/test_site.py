@@ -50,9 +50,8 @@ def test_cells_do_not_end_early() -> None:
     assert cells(shown(found)) == [["one", "two"], [r"0 \| 1", "2 3"]]
 
 
-@pytest.mark.medium
-@pytest.mark.sample(1)
 @pytest.mark.parametrize("name", [names[0] for names in families().values()])
+@pytest.mark.slow
 def test_network_pages_say_what_definitions_say(name: str) -> None:
     """Every compartment, every number with its source, every agent; λ by the flows that count; bound and plan."""
     network, page = load_network(name), network_page(name)

@@ -330,6 +330,7 @@ def test_reward_mode_does_not_touch_the_physics(scenario: str, reward: str) -> N
         np.testing.assert_array_equal(usual.state(), other.state())
 
 
+@pytest.mark.slow
 def test_truck_moves_by_its_mass() -> None:
     """Every interval of a trip is m v̇ = F − rolling − drag with m = 3 t and what is aboard, integrated by SciPy."""
     env = MultiAgentVectorEnv("solids_net", num_envs=1, scenario="reacher")
@@ -362,6 +363,7 @@ def test_truck_moves_by_its_mass() -> None:
     assert max(off) > 1e-3, "without its load the truck would have moved as well"
 
 
+@pytest.mark.slow
 def test_a_loaded_truck_takes_no_more() -> None:
     """While it stands at the sorter with a batch aboard, the next one waits, packed; nothing is lost or mixed."""
     env = MultiAgentVectorEnv("solids_net", num_envs=1, scenario="reacher")

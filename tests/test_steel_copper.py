@@ -47,6 +47,7 @@ def test_furnaces_have_what_is_published() -> None:
     np.testing.assert_allclose(ratio, 7.0, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_the_world_bears_its_copper_until_2050() -> None:
     """As Daehn, Cabrera Serrenho and Allwood (2017) expect; its content rises, as each year brings more old scrap."""
     world, run = as_usual("steel_world", "copper")

@@ -103,6 +103,7 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("form", ["pickle", "nested", "nul", "empty"])
+@pytest.mark.sample(2)
 def test_hostile_files_run_nothing(form: str, stopped: Path, tmp_path: Path) -> None:
     """Every file of a run, replaced by code or nonsense: an error of ours or no harm, and never the code."""
     proof = tmp_path / "proof"

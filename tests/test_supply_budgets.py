@@ -149,8 +149,8 @@ def scrapyard() -> Network:
 YARD_AGENTS = ("recycle", "exports", "feed")
 
 
-@pytest.mark.sample(1)
 @pytest.mark.parametrize("room", [1.001, 1.005, 1.02])
+@pytest.mark.slow
 def test_mpc_keeps_a_budget_that_needs_steps_around_supplies(room: float) -> None:
     """Plans of programs alone, which relax idle supplies, exceed it by 1 to 3 %, and waste a third of λ̄."""
     network = scrapyard()

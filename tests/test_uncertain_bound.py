@@ -220,7 +220,7 @@ def test_the_bound_is_that_of_all_paths_at_once(horizon: int, chain: Markov) -> 
         assert paths.mean(fitted) <= informed - 0.3 * (informed - best)
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_fitted_prices_close_what_foresight_is_worth() -> None:
     """A store is worth the same to who knows the demand to come, whatever it was: prices grow from nothing there."""
     network, demand = stockist(5), 0.95
@@ -567,7 +567,7 @@ def test_no_policy_exceeds_it(
     assert attacked >= 20
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_the_interval_covers_what_it_says(works_paths: Paths, works_prices: tuple[Prices, Prices]) -> None:
     """Whoever draws anew has an upper end above the best policy, the extensive form, about as often as is said."""
     chance, (values, luck) = works_paths.chance, proofs(works_paths, works_prices[1])

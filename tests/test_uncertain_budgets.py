@@ -37,7 +37,6 @@ def emitting(horizon: int) -> Network:
     return replace(network, arcs=arcs, nodes=nodes, accounts=accounts, disturbed=disturbed, time_unit="year")
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize(
     "at_most",
     [
@@ -46,6 +45,7 @@ def emitting(horizon: int) -> Network:
         {"emissions": 2.5, "cost/year": 4.5},
     ],
 )
+@pytest.mark.slow
 def test_with_budgets_too_the_bound_is_that_of_all_paths_at_once(at_most: dict[str, float]) -> None:
     """With the multipliers of the extensive form it is its optimum; with others never less, with fitted ones near."""
     network = emitting(3)
@@ -118,7 +118,7 @@ def _of_services(prices: Any) -> Any:
     return replace(prices, service=prices.service[:1], demand=prices.demand[:1])
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_the_record_says_which_budgets(kept: Any) -> None:
     """In its text, prices and figures; gaps need what is booked."""
     assert "expected emissions at most 3 t CO2e, expected cost at most 4.2 EUR_2023 a year" in str(kept)

@@ -241,6 +241,7 @@ def test_the_best_schedule_is_near_the_bound_where_nothing_is_drawn() -> None:
     assert simulate_plan(proof).episode_circularity[0] <= proof.objective
 
 
+@pytest.mark.slow
 def test_blind_actions_do_not_look() -> None:
     """They are the same in all copies; a constant is the same in all intervals."""
     env = MultiAgentVectorEnv(works(4), num_envs=5)
@@ -353,7 +354,7 @@ def test_all_are_compared_by_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
         compare((), names[:1], network=found.network, bounds=False, tune=10)
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_a_bound_goes_with_its_own_episodes() -> None:
     """It says what is demanded and drawn; of another process, number or demand it is refused, of another sight not."""
     numbers = {"arcs.lose.rate": Spread(low=0.5, high=1.5, distribution="uniform")}

@@ -224,6 +224,7 @@ def test_mpc_keeps_budgets_per_year(replan: int, share: float | None) -> None:
         assert (totals <= budgets["emissions"] * (1 + 1e-4)).all() and (totals > 0.99 * budgets["emissions"]).all()
 
 
+@pytest.mark.slow
 def test_what_a_plan_books_beyond_its_program_is_of_the_years_that_count() -> None:
     """So that the next program has less of the same year."""
     network = quarterly()
@@ -394,8 +395,9 @@ def with_random_demand(network: Network) -> Network:
     return replace(network, disturbances={"demand": demand}, disturbed=effect)
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize("futures", [None, 2])
+@pytest.mark.medium
+@pytest.mark.sample(1)
 def test_mpc_in_a_disturbed_network_keeps_each_year(futures: int | None) -> None:
     """In each copy, whether a window has all of a year or a part of it; and serves as demanded, or nearly."""
     certain = quarterly(4)

@@ -91,20 +91,19 @@ def read_rows(path: Path = KEPT_RESULTS) -> list[ResultRow]:
         raise RunError(f"{path}: is no table of results: {error}") from error
     if header != names:
         raise RunError(f"{path}: has the columns {', '.join(header)}; a table of results has {', '.join(names)}")
-    rows: list[ResultRow] = []
+    rows: dict[tuple[str, int], ResultRow] = {}
     for number, line in enumerate(lines, 2):
         place = f"{path}: row {number}"
         if len(line) != len(names):
             raise RunError(f"{place}: has {len(line)} cells, not {len(names)}")
-        rows.append(ResultRow(**{name: _cell(place, name, text) for name, text in zip(names, line, strict=True)}))
-        row = rows[-1]
+        row = ResultRow(**{name: _cell(place, name, text) for name, text in zip(names, line, strict=True)})
         if row.task not in tasks():
             raise RunError(f"{place}: {unknown_name('task', row.task, tasks())}")
         if row.variant:
             load_task(row.task).held_out(row.variant)
-        if key_of(row) in map(key_of, rows[:-1]):
+        if rows.setdefault(key_of(row), row) is not row:
             raise RunError(f"{place}: '{row.id}', variant {row.variant}, is there already")
-    return rows
+    return [*rows.values()]
 
 
 NUMBERS: Mapping[str, Callable[[str], Any]] = {
