@@ -217,6 +217,7 @@ class Supply:
                 has_room = np.where(shortage > 0, supply < range_.most - end, supply > end)
                 gap = np.where(has_room, np.abs(shortage), 0.0)
                 is_wrong = open_ & (gap > CLOSE * demand).any(axis=0)
+                expected = np.where(open_ & ~is_wrong, 0.0, expected)  # what stays as it is changes nothing
                 if not is_wrong.any() or (terms is None and correction == rounds - 1):
                     break
                 before, wrong = supply.copy(), np.flatnonzero(is_wrong)
