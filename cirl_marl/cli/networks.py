@@ -113,8 +113,8 @@ def show(
     folded_view = fold_copies(definition, stock, flow, unfold or ())
     common.console.print(nodes_table(folded_view[0], folded_view[1]))
     common.console.print(arcs_table(folded_view[0], folded_view[2]))
-    mass, flows = f" {definition.mass_unit}", f" {definition.mass_unit}/{definition.time_unit}"
-    units = {"stock": mass, "outflow": flows, "flow": flows, "measure": ""}
+    mass, rate = f" {definition.mass_unit}", f" {definition.mass_unit}/{definition.time_unit}"
+    units = {"stock": mass, "outflow": rate, "flow": rate, "measure": ""}
     for service in definition.services:
         scale, unit = (100.0, " %") if service.substance else (1.0, units[service.quantity])
         ends = [f"at least {product(service.low, scale):g}{unit}"] if extremes(service.low)[1] > 0 else []
