@@ -433,14 +433,17 @@ def test_improvement_that_fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
 
 
 @pytest.mark.slow
-def test_scenarios_write_files_of_their_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Names carry network, scenario and control, of a simulation as of a plan."""
+def test_scenarios_write_files_of_their_own(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Names carry network, scenario and control, of a simulation as of a plan; what is demanded has a unit."""
     monkeypatch.chdir(tmp_path)
     for command in ("simulate", "plan"):
         for scenario in ((), ("--scenario", "paper")):
             assert run(monkeypatch, command, "carbo_net", "--control", "neutral", *scenario) == 0
     for scenario in ((), ("--scenario", "paper")):
         assert run(monkeypatch, "show", "carbo_net", *scenario) == 0
+    assert "outflow of heaters at least 510 t/day" in capsys.readouterr().out
     names = {path.name for path in tmp_path.iterdir()}
     stems = ("carbo_net_neutral", "carbo_net_paper_neutral")
     plans = {f"plan_{stem}.{kind}" for stem in stems for kind in ("csv", "xlsx", "png")}

@@ -251,6 +251,19 @@ def test_what_leaves_a_stretched_life_is_enclosed_between_cells_too() -> None:
         assert low >= around.min() * (1 - 1.1 * CELL) and high <= around.max() * (1 + 1.1 * CELL)
 
 
+def test_a_last_stage_that_empties_and_fills_again_between_cells_holds_less() -> None:
+    """Of two cohorts, stages apart, it holds least between them, less than at either end of a cell."""
+    masses = np.zeros(12)
+    masses[[0, -1]] = 1.0
+    turnover = np.linspace(0.0, 10.0, 100_001)
+    in_last = masses @ poisson.pmf(np.arange(11, -1, -1)[:, None], turnover)
+    lowest = in_last.argmin()
+    cell = int(turnover[lowest] / CELL)
+    low, high = _last_stage_bounds(masses)(turnover[lowest] - 1e-4, turnover[lowest] + 1e-4)
+    ends = masses @ poisson.pmf(np.arange(11, -1, -1)[:, None], [cell * CELL, (cell + 1) * CELL])
+    assert low < in_last[lowest] < ends.min() <= high
+
+
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 @pytest.mark.parametrize("is_stretched", [False, True])
 def test_the_least_and_most_in_use_are_what_always_lives_shortest_and_longest(is_stretched: bool, side: float) -> None:
