@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 from test_changing_contents import NOISE, mine
@@ -240,6 +240,7 @@ def test_loops_without_stock_purify_as_far_as_they_do(seed: int, mines: int, con
 
 
 @given(seed=st.integers(0, 2**31), kind=st.sampled_from(["transfer", "share", "uncertain"]))
+@example(seed=1004, kind="share")  # the most has not settled after many rounds, the least has
 @settings(max_examples=30)
 def test_loops_that_agents_or_draws_change_have_limits(seed: int, kind: str) -> None:
     """The first sorter rejects parts p of copper and q of all else, and the second sends a share s back.

@@ -12,7 +12,7 @@ from cirl_marl.network.rowsum import Floats, Integers
 from cirl_marl.network.substances import changing_sources, separates
 
 SETTLED, ROUNDS = 1e-12, 1000
-"""Change of a range in a round that counts as none, and rounds after which what still changes may be anything."""
+"""Change of an end of a range in a round that counts as none, and rounds after which one that changes is let go."""
 ROUND_OFF = 1e-9
 """By how much sums may round."""
 MANY, POLICIES = 64, 100
@@ -62,18 +62,18 @@ def _settled_ranges(network: Any, starts: Floats, shares: Floats, is_separate: N
     entries, passed, visits = ways
     plain = np.flatnonzero(~np.isin(network.recipients, passed))
     ends = np.concatenate([network.recipients[plain], passed])
-    for done in range(ROUNDS + len(network.nodes)):
+    for done in range(ROUNDS + ranges.size):
         flows = _handed_on(ranges[:, :, network.donors], shares, is_separate)
         looped = _handed_on(flows[:, :, entries], visits, np.ones(len(entries), dtype=bool))
         wider, flows = ranges.copy(), np.concatenate([flows[:, :, plain], looped], axis=2)
         np.minimum.at(wider[0].T, ends, flows[0].T)
         np.maximum.at(wider[1].T, ends, flows[1].T)
-        changed = np.abs(wider - ranges).max(axis=(0, 1)) > SETTLED
+        changed = np.abs(wider - ranges) > SETTLED
         ranges = wider
         if not changed.any():
             break
         if done >= ROUNDS:
-            ranges[0][:, changed], ranges[1][:, changed] = 0.0, 1.0
+            ranges[0][changed[0]], ranges[1][changed[1]] = 0.0, 1.0
     changes = ranges[0] != ranges[1]
     margin = np.array([-1e-9, 1e-9])[:, None, None] * changes  # of rounding, and what was too little to have settled
     within: Floats = (ranges + margin).clip(0.0, 1.0)
