@@ -186,7 +186,7 @@ def _split_problems(network: Specification) -> Iterator[str]:
             factors = np.array([[highest.get(network.arcs[k].id, 1.0)] for k in split.controlled_arcs])
             most = float((split.bounds[1] * factors).sum(axis=0).max(initial=0.0)) if len(factors) else 0.0
             if (factors != 1).any() and most > 1 + ROUNDING:
-                fault = f"some draws of its neutral shares sum to {most:.4g}, more than 1; give ranges"
+                fault = f"some draws of its neutral shares sum to {most:.4g}, more than 1: give lower 'high'"
                 yield f"{subject}node '{split.donor}': {fault}"
                 return
         yield from (f"{subject}{fault}" for fault in trap_problems(of_substance, widest_splits(of_substance, ranges)))
@@ -239,7 +239,7 @@ def _no_content(network: Specification, node: Node, path: str) -> str:
     ]
     most = float(np.max(sum(parts)))
     by = f"disturbed by '{network.disturbed[path].by}': " if path in network.disturbed else ""
-    return f"{by}some draws of its contents sum to {most:.4g}, more than 1; give ranges" if most > 1 + ROUNDING else ""
+    return f"{by}some draws of its contents sum to {most:.4g}, more than 1: give lower 'high'" if most > 1 + ROUNDING else ""
 
 
 def _lost_capacity(network: Specification, part: Any, path: str) -> str:
