@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from importlib import import_module
-from numbers import Integral
+from numbers import Integral, Real
+from pathlib import Path
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -99,6 +102,34 @@ def whole_number(name: str, value: object, least: int) -> int:
     if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
         raise CirlError(f"{name} must be a whole number of at least {least}, got {value!r}")
     return int(value)
+
+
+def real_number(name: str, value: object, least: float = -math.inf, most: float = math.inf) -> float:
+    """Return a number, of Python or NumPy; a ``CirlError`` names one that is none, NaN, or not in [least, most].
+
+    >>> real_number("min_service", 1, 0, 1)
+    1.0
+    """
+    if not isinstance(value, Real) or isinstance(value, bool) or not least <= value <= most:
+        limits = f" in [{least}, {most}]" if most < math.inf else f" of at least {least}" if least > -math.inf else ""
+        raise CirlError(f"{name} must be a number{limits}, got {value!r}")
+    return float(value)
+
+
+def path_of(kind: str, value: Any) -> Path:
+    """Return where a file or folder is or would be; a ``CirlError`` names what can be no path, whoever made it.
+
+    >>> path_of("run", "runs/mine").name
+    'mine'
+    """
+    try:
+        path = Path(value)
+        with suppress(FileNotFoundError, NotADirectoryError):
+            path.stat()
+    except (OSError, TypeError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise CirlError(f"{kind}: {value!r} is no path: {reason}") from error
+    return path
 
 
 def optional_module(name: str, need: str, extra: str) -> Any:

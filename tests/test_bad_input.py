@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import pickle
 from dataclasses import replace
+from functools import partial
 from inspect import isfunction, signature
 from pathlib import Path
 from typing import Any
@@ -332,6 +334,36 @@ WHOLE: Any = object()
                 cirl_marl.train,
             )
         ),
+        *(
+            (lambda call=call, path=path: call(path), f"is no path: {reason}")
+            for call in (
+                cirl_marl.Trained,
+                cirl_marl.evaluate,
+                cirl_marl.plan,
+                cirl_marl.resume,
+                cirl_marl.sweep,
+                partial(cirl_marl.Team.load, make_env=None),
+            )
+            for path, reason in ((None, ""), (3, ""), ("x\0", "embedded null"), ("x" * 9999, "File name too long"))
+        ),
+        *(
+            (lambda call=call: call("[nodes.mine]\n" + "# copper\n" * 999 + "# .toml"), "no path: File name too long")
+            for call in (cirl_marl.load_network, partial(cirl_marl.train, "copper_net"))
+        ),
+        *(
+            (lambda option=option: cirl_marl.train("copper_net", **option), said)
+            for option, said in (
+                ({"min_service": "0.9"}, "min_service must be a number in [0, 1], got '0.9'"),
+                ({"min_service": {"society": 0.9}}, "min_service must be a number in [0, 1], got {"),
+                ({"min_service": math.nan}, "min_service must be a number in [0, 1], got nan"),
+                ({"checkpoint_every": "5"}, "checkpoint_every must be a number of at least 0, got '5'"),
+                ({"circularity_weight": np.complex64(0.5)}, "circularity_weight must be a number in [0, 1]"),
+                ({"callbacks": [WHOLE]}, "callbacks must be a Mapping"),
+                ({"device": None}, "unknown device of this machine 'None'"),
+            )
+        ),
+        (lambda: setattr(cirl_marl.vector_env("copper_net"), "service_factors", "x"), "service_factors is 'x'"),
+        (lambda: setattr(cirl_marl.vector_env("copper_net"), "account_charges", "x"), "charges is 'x'"),
         (lambda: cirl_marl.infer(WHOLE, []), "network must be a name of the catalogue"),
         (lambda: cirl_marl.account_front(WHOLE, "ab"), "network must be a name of the catalogue"),
         (lambda: cirl_marl.pareto_front(WHOLE, directory="x"), "network must be a name of the catalogue"),

@@ -146,7 +146,7 @@ def test_budgets_of_learners_that_cannot_be_meant_are_refused() -> None:
         with pytest.raises(CirlError, match=f"charges: {message}"):
             MultiAgentVectorEnv(network, num_envs=1, charges=charges)
     with pytest.raises(CirlError, match="charges must be finite numbers"):
-        MultiAgentVectorEnv(network, num_envs=1, charges={"cost": float("nan")})
+        MultiAgentVectorEnv(network, num_envs=1, charges={"cost": float("inf")})
     charged = parallel_env(network, reward="team", charges={"cost": 1e-6}).unwrapped
     assert charged.batch.account_charges[0] == 1e-6
 

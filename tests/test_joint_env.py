@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.utils.env_match import check_environments_match
 from gymnasium.vector import AutoresetMode
@@ -151,10 +152,15 @@ def test_what_is_refused() -> None:
     env, envs = JointEnv("copper_net"), JointVectorEnv("copper_net", 2)
     for acting in (env, envs):
         acting.reset(seed=0)
-        with pytest.raises(ControlError, match=r"actions have shape .* expected"):
+        with pytest.raises(ControlError, match=r"joint action has shape .* expected"):
             acting.step(np.zeros(3))
-        with pytest.raises(ControlError, match="must be numbers"):
+        with pytest.raises(ControlError, match="must hold numbers"):
             acting.step(np.full(acting.action_space.shape or (), "x"))
+        actions = np.zeros(acting.action_space.shape or ())
+        with pytest.raises(ControlError, match="joint action is masked in part"):
+            acting.step(np.ma.masked_array(actions, np.ones_like(actions)))
+        with pytest.raises(ControlError, match="joint action is no array of numbers"):
+            acting.step(torch.zeros(actions.shape, requires_grad=True))
     with pytest.raises(ControlError, match="must be a number in"):
         env.step(np.full(env.action_space.shape or (), np.nan))
     with pytest.raises(ControlError, match="seed"):

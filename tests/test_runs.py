@@ -111,6 +111,10 @@ def test_what_a_kill_leaves_of_a_run_that_was_being_made(
             raise Killed
         return original(*args, **options)
 
+    def begin(path: Path) -> None:
+        with RunDirectory.create(path, config, definition):
+            pass
+
     def create(allowed: int) -> None:
         nonlocal left
         left = allowed
@@ -118,7 +122,7 @@ def test_what_a_kill_leaves_of_a_run_that_was_being_made(
             for (owner, name), original in zip(operations, originals, strict=True):
                 patch.setattr(owner, name, lambda *args, original=original, **more: counted(original, *args, **more))
             patch.setattr(Path, "unlink", lambda *_, **__: None)  # nobody clears up after a kill
-            RunDirectory.create(run, config, definition)
+            begin(run)
 
     for allowed in range(100):
         try:
@@ -127,14 +131,29 @@ def test_what_a_kill_leaves_of_a_run_that_was_being_made(
         except Killed:
             kills += 1
             assert not (run / "config.json").is_file()
-            RunDirectory.create(run, config, definition)
+            begin(run)
             assert RunDirectory(run).config.steps == config.steps
             shutil.rmtree(run)
     assert kills >= 8
     (mine := tmp_path / "mine").mkdir()
     shutil.copy(definition, mine)
     with pytest.raises(RunError, match="already exists and is not empty"):
-        RunDirectory.create(mine, config, definition)
+        begin(mine)
+
+
+def test_a_run_that_another_process_is_making_is_left_to_it(tmp_path: Path, own_copper_run: Path) -> None:
+    """Half made it looks like what a crash left, and only its lock says that it is none."""
+    config, definition = RunDirectory(own_copper_run).config, own_copper_run / "network.toml"
+    (run := tmp_path / "made").mkdir()
+    shutil.copy(own_copper_run / "versions.json", run)
+    with RunDirectory(run).lock(), pytest.raises(RunError, match="is being trained by another process"):
+        with RunDirectory.create(run, config, definition):
+            pass
+    assert (run / "versions.json").is_file() and not (run / "config.json").exists()
+    with RunDirectory.create(run, config, definition) as first, pytest.raises(RunError, match="by another process"):
+        with RunDirectory(run).lock():
+            pass
+    assert first.config.steps == config.steps
 
 
 def test_directories_without_a_run_are_named(tmp_path: Path) -> None:

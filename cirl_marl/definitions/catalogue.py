@@ -11,7 +11,7 @@ from pathlib import Path
 from cirl_marl.definitions.code_permission import code_allowed
 from cirl_marl.definitions.ids import NAMESPACE, network_and_scenario
 from cirl_marl.definitions.reader import Definition
-from cirl_marl.errors import CirlError, unknown_name
+from cirl_marl.errors import CirlError, path_of, unknown_name
 from cirl_marl.network import Network
 
 IN_PACKAGE = Path(__file__).parent.parent / "_catalogue"
@@ -69,8 +69,7 @@ def load_network(name: str | Path | Network, *, scenario: str | None = None, all
         return name.scenario(scenario)
     if not isinstance(name, str | Path):
         raise CirlError(f"network must be a name of the catalogue, a file or a Network, got {name!r}")
-    if "\0" in str(name):
-        raise CirlError(f"{str(name)!r} is no name of a network or file: it has a character without a sign")
+    path_of("network", name)
     path_and_region, variant = file_and_region(str(name)), None
     if path_and_region is None:
         network = str(name)
@@ -93,7 +92,7 @@ def file_and_region(name: str) -> tuple[Path, str] | None:
 def recipe_path(name: str | Path) -> Path:
     """Return the file of a recipe of the catalogue, or ``name`` itself if it ends in ``.toml``."""
     if str(name).endswith(".toml"):
-        return Path(name)
+        return path_of("recipe", name)
     if name not in recipes():
         raise CirlError(f"{unknown_name('recipe', name, recipes())} A file of your own must end in .toml.")
     return folder("agents") / f"{name}.toml"

@@ -94,7 +94,7 @@ class Actuators:
         for agent, entries in self.entries.items():
             if agent not in actions:
                 raise ControlError(self._wrong_agents(actions))
-            action = action_array(agent, actions[agent])
+            action = action_array(f"action of agent '{agent}'", actions[agent])
             shape = (self.num_envs, entries.stop - entries.start)
             if action.shape != shape:
                 raise ControlError(wrong_shape(agent, action.shape, shape))
@@ -190,19 +190,19 @@ def planned_deviation(network: Network, agents: Sequence[str], actions: Floats, 
     return actuators.deviation(actuators.controls(np.ascontiguousarray(actions.T), steps), steps)
 
 
-def action_array(agent: str, action: ArrayLike) -> NDArray[Any]:
-    """Return an agent's action as an array.
+def action_array(subject: str, action: ArrayLike) -> NDArray[Any]:
+    """Return actions of an agent, or of all, as an array; messages begin with the ``subject``.
 
     Raises:
         ControlError: for what is no array, such as a tensor that requires a gradient, and for masked entries.
     """
     if isinstance(action, np.ma.MaskedArray) and np.ma.is_masked(action):
-        raise ControlError(f"action of agent '{agent}' is masked in part; it must hold numbers in [-1, 1]")
+        raise ControlError(f"{subject} is masked in part; it must hold numbers in [-1, 1]")
     try:
         return np.asarray(action)
     except (RuntimeError, TypeError, ValueError) as error:
         reason = str(error).split("\n")[0]
-        raise ControlError(f"action of agent '{agent}' is no array of numbers: {reason}") from error
+        raise ControlError(f"{subject} is no array of numbers: {reason}") from error
 
 
 def wrong_shape(agent: str, shape: tuple[int, ...], space_shape: tuple[int, ...]) -> str:

@@ -18,6 +18,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
+from cirl_marl.environments.actuators import action_array
 from cirl_marl.environments.parallel import OPTIONS, GymnasiumView, NetworkParallelEnv, check_options, first_copy
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, ControlError, unknown_name
@@ -58,7 +59,7 @@ class JointEnv(GymnasiumView):
             ControlError: for a wrong shape, NaN, values out of bounds, or an episode that is over.
         """
         batch = self.parallel.batch
-        outcome = self.parallel.advance(_columns(np.asarray(action)[None], (1, self._entries)))
+        outcome = self.parallel.advance(_columns(action, (self._entries,)))
         info, truncated = batch.team_info(outcome), bool(outcome.truncated[0])
         if truncated:
             info |= batch.episode_figures()
@@ -132,7 +133,7 @@ class JointVectorEnv(gymnasium.vector.VectorEnv[JointObservation, JointObservati
         if self._over:
             observation, infos = self.reset()
             return observation, np.zeros(self.num_envs), no, no.copy(), infos
-        outcome = batch.advance(_columns(np.asarray(actions), (self.num_envs, self._entries)))
+        outcome = batch.advance(_columns(actions, (self.num_envs, self._entries)))
         observation, infos = np.ascontiguousarray(outcome.observation.T), batch.team_info(outcome)
         if outcome.truncated.all():
             infos |= batch.episode_figures()
@@ -156,13 +157,14 @@ def _joint_spaces(batch: MultiAgentVectorEnv) -> tuple[Box, Box, int]:
     return Box(low, high, dtype=np.float32), Box(-1.0, 1.0, (entries,), np.float32), entries
 
 
-def _columns(actions: NDArray[Any], shape: tuple[int, ...]) -> Floats:
+def _columns(actions: ArrayLike, shape: tuple[int, ...]) -> Floats:
     """Return joint actions as columns, shape (entries, B); a ``ControlError`` says why they cannot be."""
-    if actions.shape != shape:
-        raise ControlError(f"actions have shape {actions.shape}, expected {shape}")
-    if actions.dtype.kind not in "biuf":
-        raise ControlError(f"actions are {actions!r}; they must be numbers in [-1, 1]")
-    return np.ascontiguousarray(actions.T, dtype=np.float64)
+    array = action_array("joint action", actions)
+    if array.shape != shape:
+        raise ControlError(f"joint action has shape {array.shape}, expected {shape}")
+    if array.dtype.kind not in "biuf":
+        raise ControlError(f"joint action is {array!r}; it must hold numbers in [-1, 1]")
+    return np.ascontiguousarray(np.atleast_2d(array).T, dtype=np.float64)
 
 
 def _mean(rewards: Floats) -> Floats:

@@ -196,7 +196,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
 
     def _as_row(self, agent: str, action: ArrayLike) -> NDArray[Any]:
         """Refuse an action of the wrong shape; the batch would say it with an axis that is not the user's."""
-        row, space = action_array(agent, action), self.batch.action_spaces.get(agent)
+        row, space = action_array(f"action of agent '{agent}'", action), self.batch.action_spaces.get(agent)
         if space is not None and row.shape != space.shape:
             raise ControlError(wrong_shape(agent, row.shape, space.shape))
         return row[None]

@@ -168,7 +168,7 @@ class Starts:
         state = options.get("initial_state", {})
         if not isinstance(state, Mapping):
             names = self._array_order
-            values = _numbers("initial_state", state)
+            values = float_array("initial_state", state)
             if not names or values.shape != (len(names),):
                 raise ControlError(
                     f"initial_state has shape {values.shape}: give a mapping node → stock"
@@ -211,7 +211,7 @@ class Starts:
             )
 
     def _initial(self, id_: str, values: ArrayLike) -> Floats:
-        stock = _numbers(f"initial_state of '{id_}'", values)
+        stock = float_array(f"initial_state of '{id_}'", values)
         if stock.shape not in ((), (len(self.streams),)):
             raise ControlError(f"initial_state of '{id_}' has shape {stock.shape}, not () or {(len(self.streams),)}")
         is_stock = self._physical and bool((self._rows[id_] < self._stocks).all())
@@ -244,7 +244,8 @@ def _wholes(network: Network) -> dict[str, tuple[str, ...]]:
     return wholes
 
 
-def _numbers(label: str, values: ArrayLike) -> Floats:
+def float_array(label: str, values: ArrayLike) -> Floats:
+    """Return numbers as an array; a ``ControlError`` says by their ``label`` that they are something else."""
     try:
         array = np.asarray(values)
         if array.dtype.kind not in "iuf" or np.ma.is_masked(values):

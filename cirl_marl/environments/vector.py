@@ -22,10 +22,10 @@ from cirl_marl.dynamics.supply import Supply
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.observations import ObservationLayout
 from cirl_marl.environments.rewards import Credit, Scoring
-from cirl_marl.environments.starts import Starts
+from cirl_marl.environments.starts import Starts, float_array
 from cirl_marl.environments.state import Interval, Outcome, Snapshot, State
 from cirl_marl.environments.substance_masses import SubstanceMasses
-from cirl_marl.errors import CirlError, ControlError, unknown_name, whole_number
+from cirl_marl.errors import CirlError, ControlError, real_number, unknown_name, whole_number
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.calendar import years
 from cirl_marl.network.elements import MOMENTS, REWARDS
@@ -124,7 +124,8 @@ class MultiAgentVectorEnv:
         if horizon is not None:
             variant = variant.with_options(episode={"horizon": horizon})
         if circularity_weight is not None:
-            variant = variant.with_options(objective={"circularity_weight": _share(circularity_weight)})
+            weight = real_number("circularity_weight", circularity_weight, 0, 1)
+            variant = variant.with_options(objective={"circularity_weight": weight})
         self.network = variant
         self.num_envs = num_envs
         self.reward_mode = _choice("reward", variant.objective.reward if reward is None else reward, REWARDS)
@@ -175,7 +176,7 @@ class MultiAgentVectorEnv:
 
     @circularity_weight.setter
     def circularity_weight(self, weight: float) -> None:
-        self._credit.weigh(_share(weight))
+        self._credit.weigh(real_number("circularity_weight", weight, 0, 1))
 
     @property
     def service_factors(self) -> Floats:
@@ -184,7 +185,7 @@ class MultiAgentVectorEnv:
 
     @service_factors.setter
     def service_factors(self, factors: ArrayLike) -> None:
-        values = np.array(factors, dtype=np.float64)
+        values = float_array("service_factors", factors)
         if values.shape != self.scoring.service_factors.shape or not (np.isfinite(values) & (values >= 0)).all():
             raise CirlError(f"service_factors must be {len(self._services)} numbers of at least 0, got {factors!r}")
         self.scoring.service_factors = values
@@ -199,7 +200,7 @@ class MultiAgentVectorEnv:
 
     @account_charges.setter
     def account_charges(self, charges: ArrayLike) -> None:
-        values = np.array(charges, dtype=np.float64)
+        values = float_array("charges", charges)
         shapes = (len(self.ledger.accounts),), self.ledger.discount.shape
         if values.shape not in shapes or not np.isfinite(values).all():
             raise CirlError(f"charges must be finite numbers, one for each account, got {charges!r}")
@@ -210,8 +211,7 @@ class MultiAgentVectorEnv:
         if not isinstance(charges, Mapping):
             raise CirlError(f"charges: give {{account: number}}, got {charges!r}")
         for account, charge in charges.items():
-            if isinstance(charge, bool) or not isinstance(charge, int | float | np.number):
-                raise CirlError(f"charges: that of '{account}' must be a number, got {charge!r}")
+            real_number(f"charges: that of '{account}'", charge)
             if account not in self.ledger.accounts:
                 fault = unknown_name("account", account, self.ledger.accounts)
                 raise CirlError(f"network '{self.network.name}': charges: {fault}")
@@ -610,12 +610,6 @@ class MultiAgentVectorEnv:
     def _sight(self, state: State) -> Floats | None:
         """Return what the disturbances show of themselves, in the rows of ``layout.sights``; None if nothing."""
         return self.layout.sights.see(state.processes, state.disturbances, state.step) if self.layout.sights else None
-
-
-def _share(weight: float) -> float:
-    if isinstance(weight, bool) or not isinstance(weight, int | float | np.number) or not 0 <= weight <= 1:
-        raise CirlError(f"circularity_weight must be a number in [0, 1], got {weight!r}")
-    return float(weight)
 
 
 def _choice(option: str, value: str, choices: Sequence[str]) -> str:

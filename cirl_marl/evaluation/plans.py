@@ -13,7 +13,7 @@ from cirl_marl.controllers import Controller
 from cirl_marl.controllers.schedule import Schedule, schedule
 from cirl_marl.definitions.catalogue import file_and_region, networks
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError
+from cirl_marl.errors import CirlError, path_of
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Network
 from cirl_marl.network.elements import CIRCULARITY
@@ -130,6 +130,6 @@ def _run_of(source: str | Path | Network | RunDirectory) -> RunDirectory | None:
     """Return the training run that a source names, whether or not it is there; None for a network."""
     if isinstance(source, Network | RunDirectory):
         return source if isinstance(source, RunDirectory) else None
-    if (Path(source) / "config.json").is_file():
+    if (path_of("source", source) / "config.json").is_file():
         return RunDirectory(source)
     return None if str(source) in networks() or file_and_region(str(source)) else RunDirectory(source)

@@ -57,10 +57,10 @@ def rebuild_run(
     """
     try:
         config = RunConfig.model_validate(description["config"])
-        run = create_run(directory, config, network)
-        best, env = description["best"], run.make_env(1)
+        best = description["best"]
         name = f"{best['joint_steps']:09d}-best"
-        with torch.random.fork_rng():
+        with create_run(directory, config, network) as run, torch.random.fork_rng():
+            env = run.make_env(1)
             folder = run.begin_checkpoint(f"{name}.partial")
             for group in run.groups():
                 learner = acting_learner(group, env)

@@ -8,8 +8,8 @@ from __future__ import annotations
 import inspect
 import tempfile
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.definitions.reader import write_network
 from cirl_marl.dynamics.adjoint import derivative_obstacle
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, RecipeError, RunError, unknown_name, whole_number
+from cirl_marl.errors import CirlError, RecipeError, RunError, real_number, unknown_name, whole_number
 from cirl_marl.learners.agent_env import AgentVecEnv
 from cirl_marl.learners.algorithms import has_replay_buffer
 from cirl_marl.learners.learner import Learner, load_acting_learner
@@ -137,8 +137,7 @@ def _train(
             _learn_first(training, device)
         for (_, directory), training in zip(runs, trainings, strict=True):
             if directory is not None:
-                run = create_run(Path(directory), training.config, training.env.network)
-                claims.enter_context(run.lock())
+                run = claims.enter_context(create_run(Path(directory), training.config, training.env.network))
                 training.keep_in(run)
         run_together(trainings, callbacks=callbacks, report=report, device=device)
     return trainings
@@ -151,8 +150,10 @@ def _learn_first(training: Training, device: str) -> None:
     options = {key: config.options[key] for key in ("observe", "horizon", "uncertain") if key in config.options}
     for recipe, steps in dict.fromkeys(recipes.values()):
         first = prepare(env.network, recipe, steps=steps, seed=config.seed, agents=env.agents, **options)
-        with tempfile.TemporaryDirectory() as folder:
-            run = create_run(Path(folder) / "run", first.config, first.env.network)
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            create_run(Path(folder) / "run", first.config, first.env.network) as run,
+        ):
             first.keep_in(run)
             run_together([first], device=device)
             training.begin_from({name: run.path for name, key in recipes.items() if key == (recipe, steps)})
@@ -179,10 +180,8 @@ def prepare(
     steps = full_recipe.run.steps if steps is None else whole_number("steps", steps, 1)
     if engine is not None and engine not in ENGINES:
         raise CirlError(unknown_name("engine", engine, ENGINES))
-    if min_service is not None and not 0 <= min_service <= 1:
-        raise CirlError(f"min_service must be a level in [0, 1], got {min_service}")
     run_options: dict[str, Any] = {} if engine is None else {"engine": engine}
-    run_options |= {} if min_service is None else {"min_service": min_service}
+    run_options |= {} if min_service is None else {"min_service": real_number("min_service", min_service, 0, 1)}
     full_recipe = full_recipe.model_copy(update={"run": full_recipe.run.model_copy(update=run_options)})
     full_recipe.check(steps)
     overrides = {n: v.item() if isinstance(v, np.generic) else v for n, v in options.items() if v is not None}
@@ -197,9 +196,7 @@ def prepare(
     task: dict[str, Any] = {"network": env.network.name, "scenario": env.network.scenario_name, "agents": env.agents}
     task |= {"recipe": full_recipe, "seed": whole_number("seed", seed, 0), "steps": steps, "envs": copies}
     config = RunConfig(**task, options=settings)
-    if checkpoint_every is not None and not checkpoint_every >= 0:
-        raise CirlError(f"checkpoint_every must be seconds of at least 0, got {checkpoint_every!r}")
-    training = Training(config, env, checkpoint_every=checkpoint_every)
+    training = Training(config, env, checkpoint_every=_seconds(checkpoint_every))
     if not any(learner.spec.share_of_steps for learner in training.learners.values()):
         raise RecipeError(
             f"recipe '{full_recipe.name}': nobody learns: share_of_steps is 0 for all of {list(env.agents)}"
@@ -236,7 +233,7 @@ def resume(
             being trained, or if its directory is not whole.
     """
     check_device(device)
-    run = RunDirectory(directory)
+    run, checkpoint_every = RunDirectory(directory), _seconds(checkpoint_every)
     config = run.config
     with global_streams_claimed(), run.lock():
         config = _config_to_go_on(run, config, steps)
@@ -250,6 +247,10 @@ def resume(
         training.keep_in(run)
         run_together([training], callbacks=callbacks, report=report, device=device)
     return training
+
+
+def _seconds(checkpoint_every: float | None) -> float | None:
+    return None if checkpoint_every is None else real_number("checkpoint_every", checkpoint_every, 0)
 
 
 def _from_newest_checkpoint(
@@ -287,8 +288,9 @@ def _config_to_go_on(run: RunDirectory, config: RunConfig, steps: int | None) ->
     return config
 
 
-def create_run(directory: Path, config: RunConfig, network: Network) -> RunDirectory:
-    """Start the run directory; the definition is copied if it is still what was trained on, and written if not."""
+@contextmanager
+def create_run(directory: Path, config: RunConfig, network: Network) -> Iterator[RunDirectory]:
+    """Start a locked run directory; the definition is copied if it is still what was trained on, else written."""
     groups = {"horizon": ("episode", network.episode), "circularity_weight": ("objective", network.objective)}
     changes = {group: {name: getattr(now, name)} for name, (group, now) in groups.items() if name in config.options}
     source = network.source
@@ -297,15 +299,20 @@ def create_run(directory: Path, config: RunConfig, network: Network) -> RunDirec
         if read == network:
             data = {**load_network(network.address).data_sha256, **read.data_sha256}  # it is read by its default
             config = config.model_copy(update={"region": read.region, "data_sha256": data})
-            return RunDirectory.create(directory, config, source)
-    with tempfile.TemporaryDirectory() as folder:
-        definition = Path(folder) / "network.toml"
-        write_network(network, definition)
-        try:
-            load_network(definition)
-        except CirlError as error:
-            raise RunError(f"{directory}: a run on disk needs a network that can be read again: {error}") from error
-        return RunDirectory.create(directory, config.model_copy(update={"scenario": "default"}), definition)
+            with RunDirectory.create(directory, config, source) as run:
+                yield run
+            return
+    with ExitStack() as claims:
+        with tempfile.TemporaryDirectory() as folder:
+            definition = Path(folder) / "network.toml"
+            write_network(network, definition)
+            try:
+                load_network(definition)
+            except CirlError as error:
+                raise RunError(f"{directory}: a run on disk needs a network that can be read again: {error}") from error
+            config = config.model_copy(update={"scenario": "default"})
+            run = claims.enter_context(RunDirectory.create(directory, config, definition))
+        yield run
 
 
 def _check_options(options: Iterable[str], *functions: Callable[..., object]) -> None:

@@ -37,7 +37,7 @@ from pydantic import Field, StrictInt, ValidationError, field_validator
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.definitions.error_messages import validation_mistakes
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import RunError, unknown_name
+from cirl_marl.errors import RunError, path_of, unknown_name
 from cirl_marl.learners.recipe import OPTIONS, Group, Recipe, Settings
 from cirl_marl.network import Network
 from cirl_marl.records.files import PARTIAL as PARTIAL_FILE
@@ -55,7 +55,9 @@ from cirl_marl.records.machine import versions
 STATES = ("running", "complete", "interrupted", "failed")
 CHECKPOINT = re.compile(r"\d{9,}-(start|running|interrupted|complete|best|failed)")
 """Names of checkpoints."""
-BEFORE_CONFIG = re.compile(rf"network(\.toml)?|(versions|status)\.json|{PARTIAL_FILE.pattern}\.json|\.lock")
+LOCK = ".lock"
+"""File that who trains keeps locked."""
+BEFORE_CONFIG = re.compile(rf"network(\.toml)?|(versions|status)\.json|{PARTIAL_FILE.pattern}\.json")
 """What is in the directory of a run before its description is."""
 PARTIAL = "next.partial"
 """Folder of a checkpoint that is being written."""
@@ -109,20 +111,19 @@ class RunDirectory:
 
     def __init__(self, path: str | Path) -> None:
         """Refer to the run in the directory ``path``; nothing is read or written yet."""
-        self.path = Path(path)
+        self.path = path_of("run", path)
 
     @classmethod
-    def create(cls, path: str | Path, config: RunConfig, definition: Path) -> RunDirectory:
-        """Start a run in a new or empty directory.
+    @contextmanager
+    def create(cls, path: str | Path, config: RunConfig, definition: Path) -> Iterator[RunDirectory]:
+        """Start a run in a new or empty directory, and yield it, locked from its first file on.
 
         Raises:
-            RunError: if the directory already holds something, or the configuration cannot be written to a file.
+            RunError: if the directory already holds something, another process is at it, or the configuration cannot
+                be written to a file.
         """
         run = cls(path)
-        if run._is_half_made():
-            shutil.rmtree(run.path)
-        if run.path.exists() and (not run.path.is_dir() or any(run.path.iterdir())):
-            raise RunError(f"{run.path}: already exists and is not empty; choose another directory, or resume it")
+        run._require_free()
         config = config.model_copy(update={"definition_sha256": sha256_of(definition)})
         try:
             plain = config.model_dump(mode="json")
@@ -130,28 +131,42 @@ class RunDirectory:
         except (TypeError, ValueError) as error:
             raise RunError(f"{run.path}: a run on disk needs a recipe of plain values: {error}") from error
         run.path.mkdir(parents=True, exist_ok=True)
-        write_json(run.path / "versions.json", versions())  # the first: by it one knows what a crash left
-        folder = run.path / "network" if config.data_sha256 else run.path
-        data = {name: definition.parent / name for name in config.data_sha256}
-        for name, source in {"network.toml": definition, **data}.items():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source, folder / name)
-        run.set_status("running", 0, None)
-        write_json(run.path / "config.json", plain)  # the last: with it the directory is a run
-        return run
+        with run.lock():
+            run._require_free()  # another process may have been faster
+            for rest in run.path.iterdir():
+                if rest.is_dir():
+                    shutil.rmtree(rest)
+                elif rest.name != LOCK:
+                    rest.unlink()
+            write_json(run.path / "versions.json", versions())  # the first: by it one knows what a crash left
+            folder = run.path / "network" if config.data_sha256 else run.path
+            data = {name: definition.parent / name for name in config.data_sha256}
+            for name, source in {"network.toml": definition, **data}.items():
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(source, folder / name)
+            run.set_status("running", 0, None)
+            write_json(run.path / "config.json", plain)  # the last: with it the directory is a run
+            yield run
 
-    def _is_half_made(self) -> bool:
-        """Return whether the directory is what a crash left when it was made: parts of a run, no description."""
-        if self.path.is_symlink() or not self.path.is_dir():
-            return False
-        names = {entry.name for entry in self.path.iterdir()}
-        is_ours = any(name == "versions.json" or PARTIAL_FILE.match(name) for name in names)
-        return is_ours and all(map(BEFORE_CONFIG.fullmatch, names))
+    def _require_free(self) -> None:
+        """Refuse a directory that holds more than what a crash left when a run was made: parts of it, no description.
+
+        Raises:
+            RunError: saying so.
+        """
+        if not self.path.exists():
+            return
+        is_free = self.path.is_dir()
+        if is_free and (names := {entry.name for entry in self.path.iterdir()} - {LOCK}):
+            is_ours = any(name == "versions.json" or PARTIAL_FILE.match(name) for name in names)
+            is_free = is_ours and not self.path.is_symlink() and all(map(BEFORE_CONFIG.fullmatch, names))
+        if not is_free:
+            raise RunError(f"{self.path}: already exists and is not empty; choose another directory, or resume it")
 
     @contextmanager
     def lock(self) -> Iterator[None]:
         """Keep other processes from training this run at the same time; a ``RunError`` if one does."""
-        lock = FileLock(self.path / ".lock", blocking=False)
+        lock = FileLock(self.path / LOCK, blocking=False)
         try:
             lock.acquire()
         except Timeout:

@@ -19,7 +19,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from cirl_marl.environments.rewards import CIRCULARITY_REWARDS
 from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, RecipeError, RunError, unknown_name
+from cirl_marl.errors import CirlError, RecipeError, RunError, instance_of, unknown_name
 from cirl_marl.learners.checkpoint import read_tree, write_tree
 from cirl_marl.learners.demonstrations import Demonstrator
 from cirl_marl.learners.learner import Learner, derived_seed, has_tensorboard, load_acting_learner
@@ -195,7 +195,7 @@ class Training:
 
     def check_callbacks(self, callbacks: Mapping[str, BaseCallback]) -> None:
         """Raise a ``CirlError`` for callbacks of learners that there are not, or that run as one with others."""
-        for name in callbacks:
+        for name in instance_of(Mapping, "callbacks", callbacks):  # type: ignore[type-abstract]
             if name not in self.learners:
                 raise CirlError(f"callbacks: {unknown_name('learner', name, self.learners)}")
             if (engine := self.config.recipe.run.engine) in ("stacked", "gradients"):

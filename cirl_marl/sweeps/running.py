@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.errors import RunError
+from cirl_marl.errors import RunError, path_of
 from cirl_marl.jobs import Failure, Job, JobStatus, Tell, check_place, run_jobs
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum import NoCertificate, bound, gap
@@ -145,7 +145,7 @@ def sweep(
         KeyboardInterrupt: after Ctrl-C; what was learnt is saved.
     """
     check_place(on, workers, settings)
-    path = Path(file)
+    path = path_of("sweep", file)
     request = load_sweep(path)
     cells = cells_of(request)
     folder = SweepFolder(Path("runs") / f"sweep-{path.stem}" if out is None else Path(out))

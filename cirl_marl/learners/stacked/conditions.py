@@ -40,8 +40,8 @@ def check_device(device: str) -> None:
         CirlError: naming it, and those of this machine.
     """
     try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:  # the latter where torch is built without CUDA
+        torch.empty(0, device=torch.device(device))
+    except (RuntimeError, TypeError, AssertionError) as error:  # the latter where torch is built without CUDA
         accelerators = {"cuda": torch.cuda, "mps": torch.backends.mps}
         present = [name for name, module in accelerators.items() if module.is_available()]
         raise CirlError(unknown_name("device of this machine", device, ["cpu", *present])) from error

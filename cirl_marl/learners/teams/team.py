@@ -20,7 +20,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.preprocessing import is_image_space
 
-from cirl_marl.errors import CirlError, RecipeError, RunError, unknown_name, whole_number
+from cirl_marl.errors import CirlError, RecipeError, RunError, path_of, unknown_name, whole_number
 from cirl_marl.learners.algorithms import RESERVED_PARAMETERS, every_algorithm
 from cirl_marl.learners.checkpoint import read_tree, write_tree
 from cirl_marl.learners.learner import TENSORBOARD_ADVICE, Learner, derived_seed, has_tensorboard, predict_action
@@ -218,7 +218,7 @@ class Team:
         Raises:
             RunError: if the folder is there already, or an agent or a parameter cannot be written.
         """
-        path = Path(folder)
+        path = path_of("team", folder)
         if path.exists():
             raise RunError(f"{path}: is there already; choose another folder")
         for agent in self.agents:
@@ -244,7 +244,7 @@ class Team:
         Raises:
             RunError: if a file is missing, cannot be read, or is of another environment.
         """
-        path = Path(folder)
+        path = path_of("team", folder)
         refuse_links(path)
         state = read_tree(path, "team")
         try:
