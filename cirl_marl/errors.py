@@ -110,7 +110,7 @@ def real_number(name: str, value: object, least: float = -math.inf, most: float 
     >>> real_number("min_service", 1, 0, 1)
     1.0
     """
-    if not isinstance(value, Real) or isinstance(value, bool) or not least <= value <= most:
+    if not isinstance(value, Real) or isinstance(value, bool) or not least <= value <= most:  # type: ignore[operator]
         limits = f" in [{least}, {most}]" if most < math.inf else f" of at least {least}" if least > -math.inf else ""
         raise CirlError(f"{name} must be a number{limits}, got {value!r}")
     return float(value)

@@ -342,7 +342,7 @@ WHOLE: Any = object()
                 cirl_marl.plan,
                 cirl_marl.resume,
                 cirl_marl.sweep,
-                partial(cirl_marl.Team.load, make_env=None),
+                partial(cirl_marl.Team.load, make_env=dict),
             )
             for path, reason in ((None, ""), (3, ""), ("x\0", "embedded null"), ("x" * 9999, "File name too long"))
         ),

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import re
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -411,6 +413,18 @@ def test_solver_that_fails(
     assert "network 'bottles': HiGHS did not solve" in said
     assert what in said and "Time limit reached" in said
     assert "service" in said
+
+
+def test_terminals_that_write_no_greek() -> None:
+    """In a locale without λ it becomes a question mark; without any output the exit code says it all."""
+    bottles()
+    Path("bottles.toml").write_bytes(b"\xef\xbb\xbf" + Path("bottles.toml").read_bytes())  # as some editors begin
+    command = [sys.executable, "-m", "cirl_marl.cli", "show", "bottles.toml"]
+    places = {"PYTHONPATH": os.pathsep.join(sys.path), "PYTHONIOENCODING": "ascii"}
+    screen = subprocess.run(command, env=os.environ | places, capture_output=True, check=True)
+    assert b"\n? of the start state: -" in screen.stdout
+    silent = [sys.executable, "-c", f"import os; os.close(1); os.execv({command[0]!r}, {command!r})"]
+    assert subprocess.run(silent, env=os.environ | places, check=True, stderr=subprocess.PIPE).stderr == b""
 
 
 def test_nothing_else_than_a_bound_was_asked_for(

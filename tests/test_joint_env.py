@@ -158,7 +158,7 @@ def test_what_is_refused() -> None:
             acting.step(np.full(acting.action_space.shape or (), "x"))
         actions = np.zeros(acting.action_space.shape or ())
         with pytest.raises(ControlError, match="joint action is masked in part"):
-            acting.step(np.ma.masked_array(actions, np.ones_like(actions)))
+            acting.step(np.ma.masked_array(actions, mask=True))
         with pytest.raises(ControlError, match="joint action is no array of numbers"):
             acting.step(torch.zeros(actions.shape, requires_grad=True))
     with pytest.raises(ControlError, match="must be a number in"):

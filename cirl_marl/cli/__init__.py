@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import io
 import sys
 
 from cirl_marl.cli import (  # noqa: F401
@@ -24,6 +25,9 @@ __all__ = ["app", "main"]
 
 def main() -> None:
     """Run the command line; input that cannot be used ends it with exit code 2, a failed learner with 1."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # not every locale has a λ
     gc.set_threshold(200_000)  # most of what a command makes lasts: to look through it again and again takes long
     try:
         app()

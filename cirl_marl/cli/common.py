@@ -45,7 +45,7 @@ app = typer.Typer(
     epilog=EXAMPLES,
 )
 # without emoji=False rich prints a flag or a map for the region of FILE.toml:japan:
-console = Console(width=None if sys.stdout.isatty() else 140, emoji=False)
+console = Console(width=None if sys.stdout is not None and sys.stdout.isatty() else 140, emoji=False)
 errors = Console(stderr=True, emoji=False)
 
 

@@ -175,7 +175,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > LARGEST:
             raise DefinitionError(str(path), [f"has more than {LARGEST >> 20} MiB; keep long tables in CSV files"])
-        text = read_content(path).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
+        text = read_content(path).decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except FileNotFoundError:
         raise DefinitionError(str(path), ["no such file"]) from None
     except (OSError, UnicodeDecodeError) as error:
