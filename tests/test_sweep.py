@@ -32,7 +32,7 @@ from cirl_marl.network import Network
 from cirl_marl.sweeps import Cell, CellStatus, load_sweep, sweep
 from cirl_marl.sweeps.cells import cells_of
 from cirl_marl.sweeps.folder import SweepFolder
-from cirl_marl.sweeps.reading import SweepFile
+from cirl_marl.sweeps.reading import SweepFile, SweepOptions
 
 RECIPE = """
 name = "{name}"
@@ -124,6 +124,9 @@ def test_what_cannot_be_trained_is_refused_before_anything_is(asked: Path) -> No
     changed(Path("quick.toml"), "learner =", 'match = [{ agents = ["quarri"], algorithm = "A2C" }]\nlearner =')
     with pytest.raises(CirlError, match=r"unknown agent 'quarri'\. Did you mean 'quarry'"):
         sweep(asked, on="here")
+    climbing = SweepFile(networks=["bottles.toml"], options=SweepOptions(reward=["team", "local"]))
+    with pytest.raises(CirlError, match="engine gradients: reward 'local'"):
+        cells_of(climbing)
     assert not Path("runs").exists()
 
 
@@ -448,5 +451,7 @@ def test_without_recipes_each_network_has_its_default() -> None:
     found = [(cell.network, cell.recipe.name, cell.seed) for cell in cells_of(file)]
     recipes = {"copper_net": "exact_gradients", "net_zero": "independent_ars"}
     assert found == [(network, recipes[network], seed) for seed in (0, 1) for network in recipes]
+    scenarios = SweepFile(networks=["copper_net"], scenarios=["default", "paper"])
+    assert [cell.recipe.name for cell in cells_of(scenarios)] == ["exact_gradients", "independent_ars"]
     named = SweepFile(networks=["copper_net", "net_zero"], recipes=["mappo", "shared_ppo"])
     assert [cell.recipe.name for cell in cells_of(named)] == ["mappo", "shared_ppo"] * 2

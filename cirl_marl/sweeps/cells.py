@@ -88,23 +88,28 @@ def cells_of(file: SweepFile) -> list[Cell]:
     from cirl_marl.learners.interface import default_recipe, prepare  # they need torch
 
     cells = []
-    recipes = {
-        address: [load_recipe(name) for name in file.recipes or [default_recipe(load_network(address))]]
-        for address in file.networks
-    }
     lists = {key: values for key, values in file.options.model_dump().items() if values is not None}
     scenarios: list[str | None] = [*file.scenarios] if file.scenarios is not None else [None]
+    recipes = {
+        (address, scenario): [
+            load_recipe(name)
+            for name in file.recipes or [default_recipe(load_network(address, scenario=scenario))]
+        ]
+        for address in file.networks
+        for scenario in scenarios
+    }
     for seed, address, scenario, number, *values in itertools.product(
-        file.seeds, file.networks, scenarios, range(len(recipes[file.networks[0]])), *lists.values()
+        file.seeds, file.networks, scenarios, range(len(file.recipes or [""])), *lists.values()
     ):
-        recipe = recipes[address][number]
+        recipe = recipes[address, scenario][number]
         options = dict(zip(lists, values, strict=True))
         network = load_network(address, scenario=scenario or recipe.environment.get("scenario"))
         begins = any(learner.start is not None for _, learner in recipe.learners())
         origins = ""
         if begins or seed == file.seeds[0]:
-            config = prepare(address, recipe, seed=seed, scenario=network.scenario_name, **options).config
-            read = {name: origin.sha256 for name, origin in config.origins.items()}
+            training = prepare(address, recipe, seed=seed, scenario=network.scenario_name, **options)
+            training.stackable({})
+            read = {name: origin.sha256 for name, origin in training.config.origins.items()}
             origins = hashlib.sha256(json.dumps(read, sort_keys=True).encode()).hexdigest() if read else ""
         names: dict[str, str] = {"address": address, "network": network.name, "scenario": network.scenario_name}
         names |= {"definition_sha256": fingerprint(network), "origins": origins}
