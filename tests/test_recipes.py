@@ -219,6 +219,28 @@ def test_exact_gradients_magnify_nothing_that_hardly_varied() -> None:
             "learner.parameters.policy_kwargs.optimizer_kwargs.betas.1: must be a finite number, got inf",
         ),
         ("n_steps = 8", "policy_kwargs = 3", "parameters.policy_kwargs: PPO needs dict[str, Any] | None, got 3"),
+        ("n_steps = 8", "max_grad_norm = -0.5", "parameters.max_grad_norm: PPO needs float of at least 0, got -0.5"),
+        ("n_steps = 8", "sde_sample_freq = -5", "parameters.sde_sample_freq: PPO needs int of at least -1, got -5"),
+        (
+            '"PPO"\nparameters = { n_steps = 8',
+            '"SAC"\nparameters = { target_update_interval = 0',
+            "parameters.target_update_interval: SAC needs int of at least 1, got 0",
+        ),
+        (
+            '"PPO"\nparameters = { n_steps = 8',
+            '"ARS"\nparameters = { n_top = 9',
+            "n_top: ARS has no more than 8, got 9",
+        ),
+        (
+            '"PPO"\nparameters = { n_steps = 8',
+            '"TQC"\nparameters = { top_quantiles_to_drop_per_net = 5, policy_kwargs = { n_quantiles = 5 }',
+            "parameters.top_quantiles_to_drop_per_net: TQC has no more than 4, got 5",
+        ),
+        (
+            "n_steps = 8",
+            'policy_kwargs = { activation_fn = "tanh" }',
+            "policy_kwargs.activation_fn: is a class, which only Python can give, not a text, got 'tanh'",
+        ),
         ("n_steps = 8", "target_kl = [1.0]", "parameters.target_kl: PPO needs float | None of at least 0, got [1.0]"),
     ],
 )
@@ -275,7 +297,6 @@ def test_mistakes_that_need_the_network_are_named(tmp_path: Path) -> None:
         "policy_kwargs = { optimizer_kwargs = { lrr = 1.0 } }": "lrr",
         "policy_kwargs = { net_ach = [8] }": "unexpected keyword argument 'net_ach'",
         "policy_kwargs = { use_sde = true }": "multiple values for keyword argument 'use_sde'",
-        'policy_kwargs = { activation_fn = "tanh" }': "'str' object is not callable",
     }.items():
         path = write(tmp_path, GOOD.replace("n_steps = 8", refused))
         with pytest.raises(RecipeError, match=f"agent 'refinery': PPO refuses its parameters .*{said}"):

@@ -32,13 +32,26 @@ POLICIES: Mapping[str, type[BasePolicy]] = {CENTRAL_CRITIC: CentralCriticPolicy}
 """Policies that Stable-Baselines3 has no name for."""
 
 RESERVED_PARAMETERS = ("self", "env", "seed", "policy", "tensorboard_log", "verbose", "device", "_init_setup_model")
+SHARES = "gamma gae_lambda tau line_search_shrinking_factor"
+COUNTS = """
+    n_steps n_epochs batch_size buffer_size train_freq n_delta n_top n_eval_episodes policy_delay target_update_interval
+    cg_max_steps line_search_max_iter n_critic_updates sub_sampling_factor stats_window_size
+"""
+AMOUNTS = """
+    learning_rate learning_starts clip_range target_kl delta_std max_grad_norm vf_coef rms_prop_eps cg_damping
+    target_policy_noise target_noise_clip top_quantiles_to_drop_per_net
+"""
 BOUNDS = {
-    **dict.fromkeys(("gamma", "gae_lambda", "tau"), (0.0, 1.0)),
-    **dict.fromkeys(("n_steps", "n_epochs", "batch_size", "buffer_size", "train_freq", "n_delta"), (1.0, math.inf)),
-    **dict.fromkeys(("learning_rate", "learning_starts", "clip_range", "target_kl"), (0.0, math.inf)),
+    name: (low, high)
+    for names, low, high in (
+        (SHARES, 0.0, 1.0),
+        (COUNTS, 1.0, math.inf),
+        (AMOUNTS, 0.0, math.inf),
+        ("gradient_steps sde_sample_freq", -1.0, math.inf),
+    )
+    for name in names.split()
 }
-"""Lowest and highest number of parameters whose annotations do not say it: discount factors and how far a target
-network moves; numbers of steps, passes, transitions and perturbations; rates and distances."""
+"""Lowest and highest number of parameters whose annotations do not say it."""
 WIDEST = 2**16
 """Most units of a layer."""
 NOISES: Mapping[str, type[ActionNoise]] = {
@@ -99,7 +112,7 @@ def parameter_mistakes(name: str, parameters: Mapping[str, Any]) -> Iterator[str
     """Yield parameters that there are not, numbers like NaN, and values of another type or size than can be meant.
 
     Stable-Baselines3 checks ``policy_kwargs`` when it is constructed, but few others: an entropy coefficient that is a
-    text fails in the middle of a training, a discount of 1.5 or a batch of 0 never does.
+    text fails in the middle of a training, a discount of 1.5, a batch of 0 or gradients clipped to −1 never do.
     """
     signature = parameters_of(name)
     for key, value in parameters.items():
@@ -117,6 +130,13 @@ def parameter_mistakes(name: str, parameters: Mapping[str, Any]) -> Iterator[str
             for part, width in _leaves(f"{place}.net_arch", value.get("net_arch")):
                 if isinstance(width, bool | float) or (isinstance(width, int) and not 1 <= width <= WIDEST):
                     yield f"{part}: a layer has 1 to {WIDEST:,} units, got {width!r}"
+            for part, kind in value.items():
+                if isinstance(kind, str) and part.endswith(("_class", "_fn")):
+                    yield f"{place}.{part}: is a class, which only Python can give, not a text, got {kind!r}"
+    quantiles = (parameters.get("policy_kwargs") or {}).get("n_quantiles", 25) if name == "TQC" else 0
+    for part, most in (("n_top", parameters.get("n_delta", 8)), ("top_quantiles_to_drop_per_net", quantiles - 1)):
+        if part in signature and isinstance(number := parameters.get(part), int) and number > most:
+            yield f"parameters.{part}: {name} has no more than {most}, got {number}"
 
 
 def _is_infinite(value: object) -> bool:

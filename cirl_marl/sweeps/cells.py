@@ -92,8 +92,7 @@ def cells_of(file: SweepFile) -> list[Cell]:
     scenarios: list[str | None] = [*file.scenarios] if file.scenarios is not None else [None]
     recipes = {
         (address, scenario): [
-            load_recipe(name)
-            for name in file.recipes or [default_recipe(load_network(address, scenario=scenario))]
+            load_recipe(name) for name in file.recipes or [default_recipe(load_network(address, scenario=scenario))]
         ]
         for address in file.networks
         for scenario in scenarios
