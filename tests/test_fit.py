@@ -248,7 +248,7 @@ RISING = np.exp(0.1 * np.arange(30) + np.random.default_rng(0).normal(0, 0.1, 30
         ([1.0] * 20 + [0.0] * 5, {"kind": "markov"}, "value 0 is never left"),
         (RISING, {"kind": "resampled", "interval": "1 month"}, "a row for each control interval"),
         (RISING, {"interval": "0 year"}, "interval '0 year': write a number and a unit of time"),
-        (RISING, {"interval": "3"}, "unit '1' is inconsistent"),
+        (RISING, {"interval": "3"}, "interval '3': write a number and a unit of time, .*unit '1' is inconsistent"),
         (RISING, {"times": "yer"}, "unknown column 'yer'. Did you mean 'year'"),
     ],
 )

@@ -139,5 +139,8 @@ def test_recipe_of_another_scenario_is_refused(bottles: Network, tmp_path: Path)
     other = recipe.model_copy(update={"environment": recipe.environment | {"scenario": "crisis"}})
     with pytest.raises(CirlError, match="is for scenario 'crisis', the sweep for 'default'"):
         pareto_front(bottles, other, directory=tmp_path, points=2)
+    budget = recipe.model_copy(update={"run": recipe.run.model_copy(update={"at_most": {"cost": 3.0}})})
+    with pytest.raises(CirlError, match=r"run\.at_most: cost: no price moves while weights are compared"):
+        pareto_front(bottles, budget, directory=tmp_path, points=2)
     found = pareto_front(bottles, other, directory=tmp_path, scenario="crisis", points=2, steps=320, episodes=2)
     assert {run.config.scenario for run in found.runs} == {"crisis"}

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.errors import CirlError
+from cirl_marl.errors import CirlError, DefinitionError, NetworkError
 from cirl_marl.network.declarations import frozen_record
 from cirl_marl.network.elements import IDENTIFIER
 from cirl_marl.records.files import write_atomically
@@ -84,7 +84,10 @@ def write_first(cycle: FirstCycle, path: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         trial = Path(folder) / path.name
         trial.write_text(text, encoding="utf-8")
-        load_network(trial)
+        try:
+            load_network(trial)
+        except NetworkError as error:
+            raise DefinitionError(str(path), error.problems) from error
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from cirl_marl.definitions.catalogue import load_network
+from cirl_marl.environments.rewards import CIRCULARITY_REWARDS
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RunError, whole_number
 from cirl_marl.evaluation import compare
@@ -25,9 +26,6 @@ from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum import Bound, Envelope, NoCertificate, bound, improve_plan, simulate_plan
 from cirl_marl.optimum.bounds import highest_service
 from cirl_marl.optimum.mpc import SERVICE_FIRST
-
-WEIGHTED_REWARDS = ("mixed", "mixed_difference", "team")
-"""Reward modes in which the circularity weight has a part."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -209,12 +207,17 @@ def _check_fit(network: Network, recipe: Recipe) -> None:
     if scenario != network.scenario_name:
         other = f"the sweep for '{network.scenario_name}': ask for one"
         raise CirlError(f"recipe '{recipe.name}' is for scenario '{scenario}', {other}")
+    if recipe.run.at_most:
+        reason = f"recipe '{recipe.name}': run.at_most: {', '.join(recipe.run.at_most)}"
+        raise CirlError(
+            f"{reason}: no price moves while weights are compared, so that nobody keeps budgets; leave it out"
+        )
     env = _env(network, recipe)
     recipe.check_agents(env.agents)
-    if env.reward_mode not in WEIGHTED_REWARDS:
+    if env.reward_mode not in CIRCULARITY_REWARDS:
         raise CirlError(
             f"recipe '{recipe.name}' is paid by '{env.reward_mode}', in which the weight of circularity has no part; "
-            f"choose one that is paid by {', '.join(WEIGHTED_REWARDS)}"
+            f"choose one that is paid by {', '.join(CIRCULARITY_REWARDS)}"
         )
 
 

@@ -197,9 +197,12 @@ def _length_in_rows(interval: str, spacing: float, unit: str) -> float:
     if not interval:
         return 1.0
     length, _, name = interval.strip().partition(" ")
-    rows = number_in(length) * factor(name or "1", unit) / spacing
+    try:
+        rows, reason = number_in(length) * factor(name or "1", unit) / spacing, ""
+    except CirlError as error:
+        rows, reason = 0.0, f"; {error}"
     if not 0 < rows < math.inf:
-        raise CirlError(f"interval '{interval}': write a number and a unit of time, such as '0.25 day'")
+        raise CirlError(f"interval '{interval}': write a number and a unit of time, such as '0.25 day'{reason}")
     return rows
 
 
