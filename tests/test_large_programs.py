@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import signal
 from types import SimpleNamespace
 from typing import Any
 
@@ -41,6 +42,7 @@ from cirl_marl.optimum import (
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.certificate import verify
 from cirl_marl.optimum.improve import penalised_objective, prices
+from cirl_marl.optimum.interruption import SLOW_PROGRAM, run_until_interrupt
 from cirl_marl.optimum.mpc import MPC
 from cirl_marl.optimum.options import starting_stocks
 from cirl_marl.optimum.program import Programs
@@ -407,3 +409,31 @@ def test_what_stocks_can_be_is_compiled_once(monkeypatch: pytest.MonkeyPatch) ->
     copied = pickle.loads(pickle.dumps(found))
     assert copied.at() == found.objective and compiled == 2 * once
     np.testing.assert_array_equal(improve_plan(copied).actions, better.actions)
+
+
+@pytest.mark.parametrize("method", ["simplex", "ipx"])
+def test_a_solver_that_runs_hears_of_ctrl_c(method: str) -> None:
+    """And stops; what Ctrl-C does else, it does then, and afterwards as before."""
+    rng, size = np.random.default_rng(0), 40
+    heard: list[int] = []
+
+    class Interrupted(highspy.Highs):  # type: ignore[misc]
+        """Is interrupted in its first iteration."""
+
+        def run(self) -> Any:
+            for callback in (self.cbSimplexInterrupt, self.cbIpmInterrupt):
+                callback += lambda _: heard or [heard.append(1), signal.raise_signal(signal.SIGINT)]
+            return super().run()
+
+    highs = Interrupted()
+    highs.setOptionValue("output_flag", False)
+    highs.setOptionValue("solver", method)
+    highs.setOptionValue("presolve", "off")
+    columns = [highs.addVariable(lb=0, ub=10, obj=float(cost)) for cost in -rng.random(size)]
+    for row in rng.random((size, size)):
+        highs.addConstr(sum(float(part) * column for part, column in zip(row, columns, strict=True)) <= 9.0)
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        run_until_interrupt(highs, SLOW_PROGRAM)
+    assert highs.getModelStatus() == highspy.HighsModelStatus.kInterrupt
+    assert heard and signal.getsignal(signal.SIGINT) is before

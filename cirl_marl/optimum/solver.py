@@ -19,6 +19,7 @@ from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import NoCertificate
 from cirl_marl.optimum.certificate import Certificate, verify
+from cirl_marl.optimum.interruption import run_until_interrupt
 from cirl_marl.optimum.program import LinearProgram, Program
 
 WARM_ITERATIONS = 2000
@@ -247,7 +248,7 @@ class _ScaledProgram:
             if is_near:
                 highs.setOptionValue("simplex_dual_edge_weight_strategy", DEVEX)
             highs.setOptionValue("simplex_iteration_limit", WARM_ITERATIONS)
-        highs.run()
+        run_until_interrupt(highs, len(self._size))
         return highs
 
     def _model(self) -> highspy.HighsLp:
