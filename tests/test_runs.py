@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import multiprocessing
 import os
@@ -287,7 +288,7 @@ def test_policies_act_on_what_they_learnt_to_see(copper_run: Path) -> None:
     rollout(MultiAgentVectorEnv("copper_net", num_envs=2, horizon=3), policy, seed=0)
 
 
-def test_failed_writing_leaves_the_old_file_and_no_other(tmp_path: Path) -> None:
+def test_failed_writing_leaves_the_old_file_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Half of a file is nowhere."""
     path = tmp_path / "kept.txt"
     path.write_text("old")
@@ -302,6 +303,14 @@ def test_failed_writing_leaves_the_old_file_and_no_other(tmp_path: Path) -> None
         write_atomically(path, lambda partial: Path("/dev/full").write_text("ha"))
     assert [each.name for each in tmp_path.iterdir()] == ["kept.txt"]
     assert path.read_text() == "old"
+
+    def refuse(partial: Path, *_: Any) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(partial))
+
+    monkeypatch.setattr(Path, "write_text", refuse)
+    monkeypatch.setattr(Path, "unlink", refuse)
+    with pytest.raises(OSError, match=r"Read-only file system: '.*kept.txt'"):
+        write_atomically(path, lambda partial: partial.write_text("ha"))
 
 
 def test_two_writers_of_a_file_do_not_mix(tmp_path: Path) -> None:

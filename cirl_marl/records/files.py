@@ -12,7 +12,7 @@ import re
 import shutil
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -38,7 +38,8 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error  # which file, and not its passing name
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # it is not there any more, or never was, on a disk that cannot be written to
+            temporary.unlink()
 
 
 def _partial(folder: Path, suffix: str = "") -> Path:
