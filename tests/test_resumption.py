@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 
 from cirl_marl import CirlError, LearnerError, RecipeError, RunError
 from cirl_marl.learners.interface import resume, train
@@ -73,6 +73,15 @@ def test_misspelt_callbacks_leave_nothing_behind(tmp_path: Path, ppo_recipe: Rec
     """The check comes before the run directory, so that the same call can be made again."""
     with pytest.raises(CirlError, match="Did you mean 'mine'"):
         train("copper_net", ppo_recipe, directory=tmp_path / "run", callbacks={"mime": None})  # type: ignore[dict-item]
+    one = CheckpointCallback(1, str(tmp_path / "checkpoints"))
+    wrong: list[tuple[dict[str, Any], str]] = [
+        ({"mine": [one]}, "that of 'mine' must be a BaseCallback, several a CallbackList of them, got"),
+        ({"mine": CheckpointCallback}, "that of 'mine' must be a BaseCallback"),
+        ({"mine": one, "use": one}, "that of 'use' is that of 'mine' too"),
+    ]
+    for callbacks, message in wrong:
+        with pytest.raises(CirlError, match=f"callbacks: {message}"):
+            train("copper_net", ppo_recipe, directory=tmp_path / "run", callbacks=callbacks)
     assert not (tmp_path / "run").exists()
 
 

@@ -194,13 +194,24 @@ class Training:
                 learner.demonstrator = leader
 
     def check_callbacks(self, callbacks: Mapping[str, BaseCallback]) -> None:
-        """Raise a ``CirlError`` for callbacks of learners that there are not, or that run as one with others."""
-        for name in instance_of(Mapping, "callbacks", callbacks):  # type: ignore[type-abstract]
+        """Raise a ``CirlError`` for callbacks of learners that there are not, or that run as one, and for what is none.
+
+        A callback knows the model of one learner, so that it cannot be that of two.
+        """
+        engine, owners = self.config.recipe.run.engine, dict[int, str]()
+        for name, callback in instance_of(Mapping, "callbacks", callbacks).items():  # type: ignore[type-abstract]
+            subject = f"callbacks: that of '{name}'"
             if name not in self.learners:
                 raise CirlError(f"callbacks: {unknown_name('learner', name, self.learners)}")
-            if (engine := self.config.recipe.run.engine) in ("stacked", "gradients"):
+            if engine in ("stacked", "gradients"):
                 title = self.learners[name].agent_env.title
                 raise CirlError(f"callbacks: {title}: engine {engine} calls none; use engine lockstep or auto")
+            if not isinstance(callback, BaseCallback | None):
+                raise CirlError(f"{subject} must be a BaseCallback, several a CallbackList of them, got {callback!r}")
+            if callback is not None and owners.setdefault(id(callback), name) != name:
+                raise CirlError(
+                    f"{subject} is that of '{owners[id(callback)]}' too, and knows one model only; make two"
+                )
 
     def stackable(self, callbacks: Mapping[str, BaseCallback]) -> list[Learner]:
         """Return the learners that the engine of the run lets run as one with others.
