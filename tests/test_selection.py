@@ -359,6 +359,22 @@ def test_what_lacks_is_named(tmp_path: Path) -> None:
         assert acting_checkpoint(run).endswith(said)
 
 
+def test_budgets_that_are_not_kept_are_named(tmp_path: Path) -> None:
+    """With what is booked; those that are kept are not."""
+    network = booked(load_network("copper_net"), 0)
+    free = recipe(min_service=0.0, price_rate=0.1)
+    for name, at_most in (("tight", {"cost": -1e9}), ("wide", {})):
+        budgets = at_most | {"emissions": 1e9}
+        run = free.run.model_copy(update={"at_most": budgets})
+        train(network, free.model_copy(update={"run": run}), directory=tmp_path / name, horizon=HORIZON)
+    booked_cost = RunDirectory(tmp_path / "tight").status["best"]["figures"]["accounts"]["cost"]
+    said = acting_checkpoint(RunDirectory(tmp_path / "tight"))
+    assert said.endswith(
+        f"; it does not keep the budgets of the recipe (cost at most -1e+09 EUR_2023: {booked_cost:.6g})"
+    )
+    assert "budgets" not in acting_checkpoint(RunDirectory(tmp_path / "wide"))
+
+
 def test_one_episode_is_enough_where_nothing_is_random(tmp_path: Path) -> None:
     """An evaluation plays as many episodes as differ."""
     fixed, drawn = (MultiAgentVectorEnv(network, num_envs=2) for network in ("copper_world", "copper_net"))

@@ -16,6 +16,8 @@ from cirl_marl.evaluation.comparison import Comparison, compare
 from cirl_marl.evaluation.figures import summary
 from cirl_marl.evaluation.statistics import over_episodes
 from cirl_marl.learners.run_directory import RunDirectory
+from cirl_marl.network.elements import CIRCULARITY
+from cirl_marl.optimum.aims import aims_of
 from cirl_marl.records.files import read_record, write_json
 
 CONTROLLERS = ("neutral", "random")
@@ -135,4 +137,9 @@ def acting_checkpoint(run: RunDirectory) -> str:
         sentence += f"; none assured the service of {demand:g} that the recipe demands"
         lacks = sorted((level, service) for service, level in figures.get("levels", {}).items() if level < demand)
         sentence += f" ({', '.join(f'{service} {level:.4f}' for level, service in lacks)})" if lacks else ""
+    if config.recipe.run.at_most:
+        network, amounts = run.make_env(1).network, figures.get("accounts", {})
+        budgets = aims_of(network, CIRCULARITY, config.recipe.run.at_most).budgets
+        excess = [f"{b.text(network)}: {amounts[b.name]:.6g}" for b in budgets if amounts.get(b.name, -np.inf) > b.most]
+        sentence += f"; it does not keep the budgets of the recipe ({'; '.join(excess)})" if excess else ""
     return sentence
