@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from importlib import import_module
 from numbers import Integral, Real
@@ -154,3 +154,25 @@ def unknown_name(kind: str, name: object, known_names: Iterable[object]) -> str:
     hint = f" Did you mean '{by_lower_case[match[0]]}'?" if match else ""
     listed_names = ", ".join(options[:30]) + (f", … ({len(options)} in all)" if len(options) > 30 else "")
     return f"unknown {kind} '{name}'.{hint} Known: {listed_names or 'none'}."
+
+
+def unknown_names(
+    kind: str, names: Iterable[object], known_names: Collection[object], subject: str = ""
+) -> Iterator[str]:
+    """Yield ``subject`` and ``unknown_name`` of each name that is not known."""
+    return (f"{subject}{unknown_name(kind, name, known_names)}" for name in names if name not in known_names)
+
+
+def check_names(
+    kind: str,
+    names: Iterable[object],
+    known_names: Collection[object],
+    subject: str = "",
+    error: type[CirlError] = CirlError,
+) -> None:
+    """Raise an ``error`` that says the first of ``unknown_names``, if there is any.
+
+    >>> check_names("law", ["donor"], ["donor", "recipient"])
+    """
+    for fault in unknown_names(kind, names, known_names, subject):
+        raise error(fault)

@@ -21,7 +21,7 @@ from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, ControlError, unknown_name
+from cirl_marl.errors import CirlError, ControlError, check_names
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import frozen_record
 from cirl_marl.network.elements import ControlKind, Law, Role
@@ -275,18 +275,15 @@ def _targets(network: Network, set_points: Mapping[str, float] | None) -> dict[s
         node.id: node.set_point for node in network.nodes if node.set_point is not None and node.id in tracked_nodes
     }
     targets = defaults if set_points is None else dict(set_points)
+    check_names("node", targets, network.node_index, "LQR: set_points: ")
     for node, value in targets.items():
-        if node not in network.node_index:
-            raise CirlError(f"LQR: set_points: {unknown_name('node', node, network.node_index)}")
         if not 0.0 <= value < np.inf:
             raise CirlError(f"LQR: set_points: '{node}' = {value} must be finite and not negative")
     return targets
 
 
 def _subset(kind: str, names: Sequence[str], choices: Sequence[str]) -> tuple[str, ...]:
-    for name in names or [""]:
-        if name not in choices:
-            raise ControlError(f"LQR: {unknown_name(kind, name, choices)}")
+    check_names(kind, names or [""], choices, "LQR: ", ControlError)
     return tuple(dict.fromkeys(names))
 
 

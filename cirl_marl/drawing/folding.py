@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cirl_marl.drawing.style import readable
-from cirl_marl.errors import CirlError, unknown_name
+from cirl_marl.errors import check_names
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import Arc, Law, Node, Role
 
@@ -42,9 +42,7 @@ def fold_copies(
     Raises:
         CirlError: if there is no copy of that name.
     """
-    for region in open_copies:
-        if region not in network.copies:
-            raise CirlError(f"network '{network.name}': {unknown_name('copy to unfold', region, network.copies)}")
+    check_names("copy to unfold", open_copies, network.copies, f"network '{network.name}': ")
     if not network.copies:
         return network, stock, flow
     regions = {node: region for region, nodes in network.copies.items() for node in nodes if region not in open_copies}

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from cirl_marl.environments.actuators import action_array
 from cirl_marl.environments.parallel import OPTIONS, GymnasiumView, NetworkParallelEnv, check_options, first_copy
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, ControlError, unknown_name
+from cirl_marl.errors import CirlError, ControlError, check_names
 from cirl_marl.network import Floats, Network
 
 JointObservation = NDArray[np.float32]
@@ -96,8 +96,7 @@ class JointVectorEnv(gymnasium.vector.VectorEnv[JointObservation, JointObservati
         check_options(options, (*OPTIONS, "scenario", "agents", "reward"), "num_envs", "autoreset_mode")
         modes = {mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)}
         mode = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
-        if mode not in modes:
-            raise CirlError(unknown_name("autoreset_mode", mode, modes))
+        check_names("autoreset_mode", [mode], modes)
         self.batch = MultiAgentVectorEnv(network, num_envs=num_envs, **options)
         if not self.batch.agents:
             raise CirlError(f"network '{self.batch.network.name}': no compartment has a control, so nothing can act")

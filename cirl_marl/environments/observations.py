@@ -11,7 +11,7 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from cirl_marl.dynamics.integrator import Dynamics
-from cirl_marl.errors import CirlError, unknown_name
+from cirl_marl.errors import CirlError, check_names
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import OBSERVE, Arc
 from cirl_marl.network.processes import DisturbanceProcesses, interval_of
@@ -141,8 +141,7 @@ class ObservationLayout:
         """Lay out the observations of ``agents``; ``mode`` None takes the network's own."""
         network = dynamics.network
         mode = network.observation.mode if mode is None else mode
-        if mode not in OBSERVE:
-            raise CirlError(f"observe: {unknown_name('observation mode', mode, OBSERVE)}")
+        check_names("observation mode", [mode], OBSERVE, "observe: ")
         if mode == "stocks" and not network.observation.nodes:
             raise CirlError(f"observe: mode 'stocks' needs a scenario that lists the nodes; '{network.name}' has none")
         for agent in agents:

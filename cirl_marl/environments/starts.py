@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cirl_marl.dynamics.integrator import Dynamics
-from cirl_marl.errors import ControlError, unknown_name
+from cirl_marl.errors import ControlError, check_names, unknown_name
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.compartment_model import DiscreteTimeModel, GoalTask
 from cirl_marl.network.processes import Paths, disturbance_stream
@@ -175,9 +175,7 @@ class Starts:
                     + (f", or the values of {', '.join(names)} in this order" if names else "")
                 )
             state = dict(zip(names, values, strict=True))
-        for id_ in state:
-            if id_ not in self._rows:
-                raise ControlError(f"initial_state: {unknown_name('node or inner state', id_, self._rows)}")
+        check_names("node or inner state", state, self._rows, "initial_state: ", ControlError)
         for id_, rows in self._stages.items():
             stages = [self.names[row] for row in rows if self.names[row] in state]
             if stages and id_ in state:

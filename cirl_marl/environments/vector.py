@@ -25,7 +25,7 @@ from cirl_marl.environments.rewards import Credit, Scoring
 from cirl_marl.environments.starts import Starts, float_array
 from cirl_marl.environments.state import Interval, Outcome, Snapshot, State
 from cirl_marl.environments.substance_masses import SubstanceMasses
-from cirl_marl.errors import CirlError, ControlError, real_number, unknown_name, whole_number
+from cirl_marl.errors import CirlError, ControlError, check_names, real_number, whole_number
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.calendar import years
 from cirl_marl.network.elements import MOMENTS, REWARDS
@@ -128,8 +128,9 @@ class MultiAgentVectorEnv:
             variant = variant.with_options(objective={"circularity_weight": weight})
         self.network = variant
         self.num_envs = num_envs
-        self.reward_mode = _choice("reward", variant.objective.reward if reward is None else reward, REWARDS)
-        moment = _choice("circularity", circularity, MOMENTS)
+        self.reward_mode = variant.objective.reward if reward is None else reward
+        check_names("reward", [self.reward_mode], REWARDS)
+        check_names("circularity", [circularity], MOMENTS)
         if uncertain and not variant.uncertain:
             remedy = "give a number a deviation or a range, or leave out uncertain"
             raise CirlError(f"network '{variant.name}': nothing is uncertain; {remedy}")
@@ -143,7 +144,7 @@ class MultiAgentVectorEnv:
         self.ledger = Ledger(variant, self.dynamics.factors.ranges)
         self.scoring = Scoring(self.dynamics, self.layout, self.agents, num_envs)
         self.idle = self.supply.idle(self.agents)
-        self._credit = Credit(self.dynamics, self.supply, self.scoring, self.agents, self.reward_mode, moment)
+        self._credit = Credit(self.dynamics, self.supply, self.scoring, self.agents, self.reward_mode, circularity)
         charges = {} if charges is None else charges
         self._check_charges(charges)
         self.account_charges = [charges.get(account, 0.0) for account in self.ledger.accounts]
@@ -212,9 +213,7 @@ class MultiAgentVectorEnv:
             raise CirlError(f"charges: give {{account: number}}, got {charges!r}")
         for account, charge in charges.items():
             real_number(f"charges: that of '{account}'", charge)
-            if account not in self.ledger.accounts:
-                fault = unknown_name("account", account, self.ledger.accounts)
-                raise CirlError(f"network '{self.network.name}': charges: {fault}")
+            check_names("account", [account], self.ledger.accounts, f"network '{self.network.name}': charges: ")
         if any(charges.values()) and self.reward_mode in ("local", "local_sum"):
             raise CirlError(f"charges count in rewards with λ, not in '{self.reward_mode}'")
 
@@ -610,12 +609,6 @@ class MultiAgentVectorEnv:
     def _sight(self, state: State) -> Floats | None:
         """Return what the disturbances show of themselves, in the rows of ``layout.sights``; None if nothing."""
         return self.layout.sights.see(state.processes, state.disturbances, state.step) if self.layout.sights else None
-
-
-def _choice(option: str, value: str, choices: Sequence[str]) -> str:
-    if value not in choices:
-        raise CirlError(unknown_name(option, value, choices))
-    return value
 
 
 def _keep_freed_memory() -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import tomlkit
 
 from cirl_marl.definitions.data_files import DataFiles, number_in
-from cirl_marl.errors import CirlError, unknown_name
+from cirl_marl.errors import CirlError, check_names
 from cirl_marl.importing.definition import identifier
 from cirl_marl.importing.process_estimates import (
     DIGITS,
@@ -164,8 +164,7 @@ def fit_disturbances(
 
 def _check_options(options: FitOptions, columns: Sequence[str]) -> None:
     for label, word, words in (("kind to fit", options.kind, KINDS), ("trend", options.trend, TRENDS)):
-        if word not in words:
-            raise CirlError(unknown_name(label, word, words))
+        check_names(label, [word], words)
     if not columns:
         raise CirlError("fit: which column?")
     if (options.kind == "seasonal") != (options.seasons > 1):

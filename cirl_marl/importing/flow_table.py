@@ -13,7 +13,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from cirl_marl.definitions.data_files import no_collection, number_in
-from cirl_marl.errors import CirlError, first_lines, unknown_name
+from cirl_marl.errors import CirlError, check_names, first_lines
 from cirl_marl.importing.grids import Grid, GridPart, Memo, is_year, plain_text, read_grids
 from cirl_marl.importing.substance_flows import SubstanceFlows, SubstanceRows, amount_scale
 from cirl_marl.network import Floats, Integers
@@ -81,9 +81,7 @@ class FlowTable:
             CirlError: for one that is not there; names the nearest.
         """
         regions = list(map(plain_text, regions))
-        for region in regions:
-            if region not in self.regions:
-                raise CirlError(f"{self.name}: {unknown_name('region', region, self.regions)}")
+        check_names("region", regions, self.regions, f"{self.name}: ")
         kept = np.isin(self.places[0], [i for i, region in enumerate(self.regions) if region in regions])
         places = self.places[:, kept]
         orders = [_order_of_appearance(numbers) for numbers in (places[0], places[2])]

@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 
 from cirl_marl.definitions.data_files import Block, csv_blocks, number_in
-from cirl_marl.errors import CirlError, first_lines, unknown_name
+from cirl_marl.errors import CirlError, check_names, first_lines
 from cirl_marl.importing.workbooks import read_sheets
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import LARGEST, SMALLEST
@@ -200,8 +200,7 @@ def _sheet_names(path: Path, names: Sequence[str], sheet: str | None) -> Sequenc
     """Return which sheets of a workbook are read: the one that is named, those of years, or the first."""
     if sheet is None:
         return [name for name in names if is_year(name)] or names[:1]
-    if sheet not in names:
-        raise CirlError(f"{path}: {unknown_name('sheet', sheet, names)}")
+    check_names("sheet", [sheet], names, f"{path}: ")
     return [sheet]
 
 

@@ -12,7 +12,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, Protocol
 
-from cirl_marl.errors import CirlError, optional_module, unknown_name, whole_number
+from cirl_marl.errors import CirlError, check_names, optional_module, whole_number
 from cirl_marl.jobs.slurm import Slurm, sbatch_options, settings_text
 from cirl_marl.jobs.work import Work, text_lines
 
@@ -188,8 +188,7 @@ def check_place(on: str, workers: int | None = None, settings: Mapping[str, str]
     Raises:
         CirlError: for an unknown place, workers or settings that it does not take, or a package that is missing.
     """
-    if on not in PLACES:
-        raise CirlError(unknown_name("place", on, PLACES))
+    check_names("place", [on], PLACES)
     if settings and on != "slurm":
         raise CirlError(f"{settings_text(settings)}: goes with --on slurm, not with --on {on}")
     if workers is not None:

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import numpy as np
 from scipy.sparse import csgraph
 
-from cirl_marl.errors import unknown_name
+from cirl_marl.errors import unknown_name, unknown_names
 from cirl_marl.network.declarations import (
     CheckedRecord,
     Declaration,
@@ -425,11 +425,7 @@ def disturbance_problems(network: Specification) -> Iterator[str]:
     for name, disturbance in disturbances.items():
         mistakes = [*bound_problems(disturbance), *_infinite_values(disturbance)] or list(disturbance.problems())
         mistakes += _sight_problems(disturbance)
-        mistakes += (
-            f"observed_by: {unknown_name('agent', id_, compartments)}"
-            for id_ in disturbance.observed_by
-            if id_ not in compartments
-        )
+        mistakes += unknown_names("agent", disturbance.observed_by, compartments, "observed_by: ")
         yield from (f"disturbances.{name}: {mistake}" for mistake in mistakes)
     for path, disturbed in network.disturbed.items():
         if disturbed.by not in disturbances:

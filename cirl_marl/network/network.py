@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from cirl_marl.errors import CirlError, NetworkError, unknown_name
+from cirl_marl.errors import CirlError, NetworkError, check_names, unknown_name
 from cirl_marl.network.declarations import declarations
 from cirl_marl.network.elements import SINKS, Arc, Compartment, ControlKind, Law, Node, Role, Service
 from cirl_marl.network.initial_ages import age_shares, remaining_history
@@ -119,11 +119,9 @@ class Network(Specification):
         3
         """
         for group, values in groups.items():
-            if group not in (options := ["episode", "objective", "observation"]):
-                raise CirlError(f"with_options: {unknown_name('group', group, options)}")
-            options = [item.name for item in fields(getattr(self, group))]
-            for name in [item for item in values if item not in options]:
-                raise CirlError(f"with_options: {group}: {unknown_name('field', name, options)}")
+            check_names("group", [group], ["episode", "objective", "observation"], "with_options: ")
+            names = [item.name for item in fields(getattr(self, group))]
+            check_names("field", values, names, f"with_options: {group}: ")
         changes = {group: replace(getattr(self, group), **dict(values)) for group, values in groups.items()}
         return self.variant(**changes)
 

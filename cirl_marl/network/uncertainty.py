@@ -239,7 +239,9 @@ def _no_content(network: Specification, node: Node, path: str) -> str:
     ]
     most = float(np.max(sum(parts)))
     by = f"disturbed by '{network.disturbed[path].by}': " if path in network.disturbed else ""
-    return f"{by}some draws of its contents sum to {most:.4g}, more than 1: give lower 'high'" if most > 1 + ROUNDING else ""
+    if most <= 1 + ROUNDING:
+        return ""
+    return f"{by}some draws of its contents sum to {most:.4g}, more than 1: give lower 'high'"
 
 
 def _lost_capacity(network: Specification, part: Any, path: str) -> str:

@@ -14,7 +14,7 @@ from typing import Annotated
 from pydantic import TypeAdapter
 
 from cirl_marl.definitions.reader import read_toml
-from cirl_marl.errors import CirlError, unknown_name
+from cirl_marl.errors import check_names
 from cirl_marl.network.declarations import frozen_record
 
 SOURCE = "Zocco, Corti, Malvezzi: CiRL, arXiv 2505.21536"
@@ -87,6 +87,5 @@ def environment_of(name: str) -> PaperEnvironment:
     >>> environment_of("CopperNet").steps
     200000
     """
-    if name not in ENVIRONMENTS:
-        raise CirlError(unknown_name("environment of the paper", name, ENVIRONMENTS))
+    check_names("environment of the paper", [name], ENVIRONMENTS)
     return ENVIRONMENTS[name]

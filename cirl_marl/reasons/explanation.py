@@ -12,7 +12,7 @@ import numpy as np
 
 from cirl_marl.controllers.rollout import first_seed, rollout, starting_stocks
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.errors import CirlError, unknown_name, whole_number
+from cirl_marl.errors import CirlError, check_names, whole_number
 from cirl_marl.evaluation.baselines import levels_to_demand
 from cirl_marl.evaluation.comparison import part_of
 from cirl_marl.learners.run_directory import RunDirectory
@@ -86,8 +86,7 @@ def explain(
     for part in parts or ():
         if part in PARTS and part not in possible:
             raise CirlError(f"explain {source}: {part} are those of policies, and a network has none; give a run")
-        if part not in possible:
-            raise CirlError(f"explain: {unknown_name('part', part, possible)}")
+        check_names("part", [part], possible, "explain: ")
     if run is None:
         assert not isinstance(source, RunDirectory)
         network = load_network(source, scenario=scenario)

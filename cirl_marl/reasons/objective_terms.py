@@ -14,7 +14,7 @@ from typing import Annotated
 import numpy as np
 
 from cirl_marl.drawing.style import readable
-from cirl_marl.errors import CirlError, unknown_name
+from cirl_marl.errors import CirlError, check_names
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Arc, Node, Role
@@ -139,9 +139,7 @@ def objective_terms(network: Network, kinds: Sequence[str] = KINDS) -> list[Obje
     Raises:
         CirlError: for an unknown kind, or if there are not two terms to weigh.
     """
-    for kind in kinds:
-        if kind not in KINDS:
-            raise CirlError(f"terms: {unknown_name('kind', kind, KINDS)}")
+    check_names("kind", kinds, KINDS, "terms: ")
     weighable: list[ObjectiveTerm] = []
     if "circularity" in kinds:
         parts: dict[str, Floats] = {}

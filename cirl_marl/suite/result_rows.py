@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from filelock import FileLock
 
-from cirl_marl.errors import CirlError, RunError, unknown_name
+from cirl_marl.errors import RunError, check_names
 from cirl_marl.network.declarations import KeptRecord, frozen_record
 from cirl_marl.records.files import sha256_of, write_table
 from cirl_marl.suite.tasks import CONTROLLERS, PACKAGE_DATA, BenchmarkTask, Figures, load_task, tasks
@@ -97,8 +97,7 @@ def read_rows(path: Path = KEPT_RESULTS) -> list[ResultRow]:
         if len(line) != len(names):
             raise RunError(f"{place}: has {len(line)} cells, not {len(names)}")
         row = ResultRow(**{name: _cell(place, name, text) for name, text in zip(names, line, strict=True)})
-        if row.task not in tasks():
-            raise RunError(f"{place}: {unknown_name('task', row.task, tasks())}")
+        check_names("task", [row.task], tasks(), f"{place}: ", RunError)
         if row.variant:
             load_task(row.task).held_out(row.variant)
         if rows.setdefault(key_of(row), row) is not row:
@@ -164,9 +163,7 @@ def verify(path: Path = KEPT_RESULTS, ids: Sequence[str] = (), *, variants: bool
     """
     rows = read_rows(path)
     row_ids = {row.id for row in rows}
-    for id_ in ids:
-        if id_ not in row_ids:
-            raise CirlError(f"{path}: {unknown_name('row', id_, row_ids)}")
+    check_names("row", ids, row_ids, f"{path}: ")
     selection = [row for row in rows if (not ids or row.id in ids) and (variants or not row.variant)]
     for row in selection:
         _verify(path, row)
@@ -230,8 +227,7 @@ def pretrained(id: str, folder: str | Path | None = None, *, results: str | Path
     """
     path = Path(results)
     rows = {row.id: row for row in read_rows(path) if row.seed is not None and row.weights and not row.variant}
-    if id not in rows:
-        raise CirlError(unknown_name("policy", id, rows))
+    check_names("policy", [id], rows)
     row, weights = rows[id], path.parent / rows[id].weights
     if weights.is_file() and sha256_of(weights) != row.sha256:
         raise RunError(f"{weights}: is not the file of row '{id}' in {path}: another SHA-256")

@@ -18,7 +18,7 @@ from cirl_marl.definitions.ids import NAMESPACE
 from cirl_marl.definitions.overrides import overlay
 from cirl_marl.definitions.reader import read_toml
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, RunError, unknown_name
+from cirl_marl.errors import CirlError, RunError, check_names, unknown_name
 from cirl_marl.evaluation.statistics import SHARE, Aggregate, over_episodes
 from cirl_marl.learners.recipe import Recipe, load_recipe
 from cirl_marl.network import Network
@@ -181,8 +181,7 @@ def load_task(name: str) -> BenchmarkTask:
         CirlError: if there is none; names the nearest.
     """
     document, name = _declaration(), str(name).removeprefix(NAMESPACE)
-    if name not in document["tasks"]:
-        raise CirlError(unknown_name("task", name, document["tasks"]))
+    check_names("task", [name], document["tasks"])
     entry = dict(document["tasks"][name])
     common: dict[str, Any] = {key: document[key] for key in ("min_service", "tolerance")}
     lists: dict[str, Any] = {"seeds": tuple(document["seeds"]), "sha256": tuple(entry.pop("sha256", ()))}

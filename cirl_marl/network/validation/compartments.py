@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from cirl_marl.errors import CirlError, unknown_name
+from cirl_marl.errors import CirlError, unknown_name, unknown_names
 from cirl_marl.network.compartment_model import CompartmentModel, OutflowModel, ReleasingModel, Vehicle
 from cirl_marl.network.declarations import LARGEST, SMALLEST, bound_problems, default_of
 from cirl_marl.network.elements import (
@@ -179,9 +179,7 @@ def _rule_problems(subject: str, compartment: Compartment, rule: FeedbackRule, n
     disturbing = {disturbed.by for disturbed in network.disturbed.values()}
     names = [name for name in network.disturbances if name in disturbing]
     for key, options, what in (("follows", names, "disturbance that disturbs something"), ("watches", aims, "aim")):
-        for name in getattr(rule, key):
-            if name not in options:
-                yield f"{subject}.{key}: {unknown_name(what, name, options)}"
+        yield from unknown_names(what, getattr(rule, key), options, f"{subject}.{key}: ")
     if len(rule.gains) != len(rule.watches):
         yield f"{subject}: needs a gain for each of what it watches, got {len(rule.gains)} for {len(rule.watches)}"
 
@@ -225,9 +223,9 @@ def _model_problems(subject: str, compartment: Compartment, model: CompartmentMo
         yield f"{subject} needs a control of kind 'input' for {', '.join(inputs)}, not {range_}"
     vehicle_quantities = ("load_kg",) if isinstance(compartment, Arc) and _has_vehicle(compartment) else ()
     quantities = ("stock_kg",) if isinstance(compartment, Node) else vehicle_quantities
-    for name in model.context_names:
-        if name not in quantities:
-            yield f"{subject}: context_names: {unknown_name('quantity told to this model', name, quantities)}"
+    yield from unknown_names(
+        "quantity told to this model", model.context_names, quantities, f"{subject}: context_names: "
+    )
     states = model.ranged_states
     ranges = dict(zip(states, compartment.inner, strict=True)) if len(states) == len(compartment.inner) else {}
     if control is not None:

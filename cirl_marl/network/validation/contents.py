@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from cirl_marl.errors import unknown_name
+from cirl_marl.errors import unknown_name, unknown_names
 from cirl_marl.network.declarations import bound_problems
 from cirl_marl.network.elements import Arc, ControlKind, Law, Node
 from cirl_marl.network.initial_ages import content_edges
@@ -44,9 +44,7 @@ def substance_problems(network: Specification) -> Iterator[str]:
 
 def _content_problems(network: Specification, node: Node, substances: list[str]) -> Iterator[str]:
     subject = f"node '{node.id}': content"
-    for id_ in dict(node.content):
-        if id_ not in substances:
-            yield f"{subject}: {unknown_name('substance', id_, substances)}"
+    yield from unknown_names("substance", dict(node.content), substances, f"{subject}: ")
     if not node.stores:
         yield f"{subject}: it stores nothing, and what it hands on has the content of what enters it"
     series = [part for part in dict(node.content).values() if isinstance(part, Series)]
@@ -78,9 +76,7 @@ def _transfer_problems(arc: Arc, substances: list[str]) -> Iterator[str]:
     if arc.transfer and arc.law is not Law.SHARE:
         yield f"{subject}: transfer: law '{arc.law}' takes none; substances are separated by arcs of law 'share'"
     for key, ids in (("transfer", dict(arc.transfer)), ("control.substances", controlled)):
-        for id_ in ids:
-            if id_ not in substances:
-                yield f"{subject}: {key}: {unknown_name('substance', id_, substances)}"
+        yield from unknown_names("substance", ids, substances, f"{subject}: {key}: ")
     yield from repetitions(f"{subject}: control.substances", controlled)
     for id_ in dict(arc.transfer):
         if id_ in controlled:

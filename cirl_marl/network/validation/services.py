@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from cirl_marl.errors import unknown_name
+from cirl_marl.errors import unknown_name, unknown_names
 from cirl_marl.network.compartment_model import MeasuringModel
 from cirl_marl.network.declarations import bound_problems
 from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Node, Service
@@ -68,9 +68,7 @@ def _service_problems(
     if service.measure and service.quantity != "measure":
         yield f"{subject}: measure '{service.measure}': quantity '{service.quantity}' takes none"
     yield from repetitions(f"{subject}: owed_by", service.owed_by)
-    for debtor in service.owed_by:
-        if debtor not in compartments:
-            yield f"{subject}: owed_by: {unknown_name('compartment', debtor, compartments)}"
+    yield from unknown_names("compartment", service.owed_by, compartments, f"{subject}: owed_by: ")
     low, high = (np.array(network.interval_means(id_)) for id_ in (service.low, service.high))
     if extremes(service.low)[0] < 0:
         yield f"{subject}: low {extremes(service.low)[0]:g} must not be negative"

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 
-from cirl_marl.errors import CirlError, unknown_name
+from cirl_marl.errors import CirlError, unknown_names
 from cirl_marl.network.calendar import LAST_YEAR, years
 from cirl_marl.network.compartment_model import ContinuousModel, DiscreteTimeModel, OwnStepModel
 from cirl_marl.network.declarations import bound_problems
@@ -33,16 +33,12 @@ def setting_problems(network: Specification) -> Iterator[str]:
     with_set_point = dict.fromkeys(c.id for c in compartments if c.set_point is not None)
     yield from repetitions("objective.tracked", objective.tracked)
     yield from repetitions("observation.nodes", network.observation.nodes)
-    for name in objective.tracked:
-        if name not in with_set_point:
-            yield f"objective.tracked: {unknown_name('compartment with a set_point', name, with_set_point)}"
+    yield from unknown_names("compartment with a set_point", objective.tracked, with_set_point, "objective.tracked: ")
     if (network.observation.mode == "stocks") != bool(network.observation.nodes):
         yield "observation: mode 'stocks', and only that mode, lists its nodes"
     inner = [f"{c.id}.{name}" for c in compartments if c.model is not None for name in c.model.state_names]
     signals = dict.fromkeys((*(node.id for node in network.nodes), *inner))
-    for name in network.observation.nodes:
-        if name not in signals:
-            yield f"observation: {unknown_name('node or inner state', name, signals)}"
+    yield from unknown_names("node or inner state", network.observation.nodes, signals, "observation: ")
 
 
 def calendar_problems(network: Specification) -> Iterator[str]:
