@@ -150,7 +150,7 @@ def lives() -> Iterator[str]:
 def spread(network: Network) -> Iterator[str]:
     """Yield how λ̄ as usual spreads, and which number causes it."""
     found = sample_episodes(network, samples=SAMPLES)
-    mean = found.circularity.mean(axis=1) / 1e3
+    mean = found.rollout.episode_circularity / 1e3
     low, high = np.quantile(mean, (0.025, 0.975)).tolist()
     (cause, *_) = sensitivities(found)
     yield f"As usual, {SAMPLES} draws: λ̄ = {mean.mean():.1f} Mt/a, 95 % in [{low:.1f}, {high:.1f}]."

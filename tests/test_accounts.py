@@ -394,7 +394,9 @@ def test_revenues_may_be_uncertain(tmp_path: Path) -> None:
     file.write_text(text.replace(rate, f"{rate}, range = [-120, -60]"), encoding="utf-8")
     plain = tuple(replace(node, holding={}) for node in network.nodes)
     samples = sample_episodes(replace(load_network(file), nodes=plain), samples=16)
-    booked_rates = samples.bookings[:, 0].sum(axis=1) / samples.flow[:, :, network.arc_index["feed"]].sum(axis=1)
+    booked_rates = samples.rollout.bookings[:, 0].sum(axis=1) / samples.rollout.flow[
+        :, :, network.arc_index["feed"]
+    ].sum(axis=1)
     scale = network.episode.control_interval
     assert -120 <= booked_rates.min() / scale < -90 and -70 < booked_rates.max() / scale <= -60
     for wrong, message in (("[-60, -120]", "have its lower end first, -80"), ("[-60, -40]", "contain the number, -80")):
@@ -637,7 +639,10 @@ def test_samples_and_comparisons_tell_what_is_booked(tmp_path: Path) -> None:
     price = {"arcs.virgin_fibre.accounts.cost": Spread(deviation=0.2)}
     network = replace(city(), uncertain=price).with_options(episode={"horizon": 10})
     samples = sample_episodes(network, samples=80)
-    assert np.ptp(samples.accounts[:, 0]) > 0 and np.ptp(samples.accounts[:, 1]) <= 1e-9 * samples.accounts[:, 1].max()
+    assert (
+        np.ptp(samples.rollout.accounts[:, 0]) > 0
+        and np.ptp(samples.rollout.accounts[:, 1]) <= 1e-9 * samples.rollout.accounts[:, 1].max()
+    )
     by_figure = {cause.figure: cause.shares[0] for cause in sensitivities(samples)}
     assert by_figure["cost"] > 0.9 and np.isnan(by_figure["emissions"])
     bands, draws, *_ = write_samples(tmp_path, "city", samples, [], title="city")

@@ -287,7 +287,7 @@ def test_groups_points_and_plans(tmp_path: Path, opened: Any) -> None:
     ]
     tab.page.locator("#time").press("End")
     behind = [tab.texts(f"#curves figure:nth-of-type({i}) .values .figure") for i in (2, 3)]
-    last, best = float(usual.circularity.value[-1]), float(plan.circularity.value[-1])
+    last, best = (float(episode.bands["circularity"][0].value[-1]) for episode in (usual, plan))
     assert [[float(text.replace("−", "-")) for text in each] for each in behind] == [
         [pytest.approx(best - last, rel=0.01)],
         [pytest.approx(-0.5 - last, rel=0.01)],

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from series_definition import column, definition, written
 
 from cirl_marl import Episode, Network, NetworkError, Node, load_network, parallel_env, vector_env
+from cirl_marl import simulate as simulated
 from cirl_marl.cli.episodes import plan, simulate
 from cirl_marl.network.calendar import YearOrDate, elapsed_time, labels, year, years
 from cirl_marl.report import curves
@@ -142,16 +143,14 @@ def test_axes_show_years(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     figures: list[Figure] = []
     monkeypatch.setattr(curves, "save", lambda figure, path: figures.append(figure))
     for start, label, ends in ((2000, "year", (2000.0, 2003.0)), (None, "time / year", (0.0, 3.0))):
-        made = network(start, "year")
-        time = np.arange(1.0, 4.0)
-        flow, stock = np.empty((0, 3)), np.ones((1, 3))
-        curves.save_trajectory(tmp_path / "x.png", made, time, stock, flow, -time, start=np.ones(1))
+        simulation, time = simulated(network(start, "year"), steps=3), np.arange(1.0, 4.0)
+        curves.save_trajectory(tmp_path / "x.png", simulation)
         axes = figures[-1].axes[-1]
         assert axes.get_xlabel() == label
         assert axes.get_xlim() == ends
         means = np.asarray(figures[-1].axes[2].lines[0].get_xdata(), dtype=np.float64)
         np.testing.assert_allclose(means, ends[0] + time - 0.5)  # in the middle of their intervals
-        curves.save_circularity(tmp_path / "x.png", made, time, {"neutral": -time}, {"neutral": time / 3})
+        curves.save_circularity(tmp_path / "x.png", simulation.network, {"neutral": simulation.rollout})
         assert figures[-1].axes[-1].get_xlabel() == label
         assert figures[-1].axes[-1].get_xlim() == (ends[0] + 0.5, ends[1] - 0.5)  # means stand in the middle
 

@@ -110,7 +110,7 @@ def test_simulate_writes_csv_and_picture(control: str, monkeypatch: pytest.Monke
     drawn: list[np.ndarray] = []
 
     def recorded(*arguments: Any, **options: Any) -> Path:
-        drawn.append(arguments[5])
+        drawn.append(arguments[1].rollout.circularity_mean[0])
         return save_trajectory(*arguments, **options)
 
     monkeypatch.setattr(trajectory, "save_trajectory", recorded)
@@ -545,8 +545,10 @@ def test_pictures_of_a_run_show_mean_circularity(trained: Path, monkeypatch: pyt
     pictures.draw_run(evaluation)
     network, before, after, _, shown, _ = drawn["save_before_after"]
     assert shown == pytest.approx([float(network.circularity(flow)) for _, flow in (before, after)], rel=1e-9)
-    for name, curve in drawn["save_circularity"][2].items():
-        assert curve.mean() == pytest.approx(evaluation.figures["controllers"][name]["circularity"]["value"], rel=1e-12)
+    for name, rollout in drawn["save_circularity"][1].items():
+        assert rollout.episode_circularity.mean() == pytest.approx(
+            evaluation.figures["controllers"][name]["circularity"]["value"], rel=1e-12
+        )
     pictures.draw("x.png", evaluation, title="a heading")
     assert drawn["save_circularity"][-1] == "a heading"
 

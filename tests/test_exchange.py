@@ -6,9 +6,11 @@ import csv
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
+from conftest import random_network
 from small_networks import ACCOUNTS, city
 from typer.testing import CliRunner
 
@@ -20,9 +22,13 @@ from cirl_marl import (
     write_network,
 )
 from cirl_marl.cli import app
+from cirl_marl.controllers.episode_quantities import QuantityKind, episode_quantities
 from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.report.data_package import read_package, write_package
 from cirl_marl.report.iamc import read_iamc, write_iamc
+from cirl_marl.report.report_page import page_of_alternatives
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
 @pytest.mark.slow
@@ -210,3 +216,35 @@ def _size(simulation: Simulation) -> int:
     parts = {(simulation.env.ledger.account[e], c) for e, c in enumerate(simulation.env.ledger.compartments)}
     figures = 1 + len(network.services) + len(network.stores) + len(network.arcs)
     return figures + len(network.accounts) + len(parts)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_tables_and_pages_have_every_quantity(seed: int) -> None:
+    """Each stands once in the table of its episode, with the values of the rollout; what disturbs and contents too."""
+    networks = random_network(seed, 6, 12, lifetimes=True), city(), load_network(EXAMPLES / "copper_in_steel.toml")
+    weather = load_network("carbo_net", scenario="weather")
+    for case in (*networks, weather):
+        simulation = simulate(case, "random", seed=seed, steps=min(3, case.episode.horizon))
+        network, steps = simulation.network, simulation.network.episode.horizon
+        header, (first, *rows) = simulation.table()
+        columns, run = dict(zip(header, zip(*rows, strict=True), strict=True)), simulation.rollout
+        assert len(columns) == len(header)
+        quantities = episode_quantities(network)
+        assert len({(part.kind, part.of, part.substance) for part in quantities}) == len(quantities)
+        for part in quantities:
+            times, curve = part.points(network, run)
+            assert len(times) == len(curve) == steps + (part.kind == "stock")
+            if part.kind != "service":  # of which the table has the mean
+                np.testing.assert_array_equal(columns[part.heading], part.values(run)[0])
+            if part.kind == "stock":
+                assert first[header.index(part.heading)] == curve[0] == run.start[part.place]
+        parts = {kind: [p.values(run)[0] for p in quantities if p.kind == kind] for kind in get_args(QuantityKind)}
+        np.testing.assert_array_equal(np.reshape(parts["service"], run.levels[0].shape), run.levels[0])
+        for kind, values in (("flow", run.flow), ("disturbance", run.disturbances[0])):
+            np.testing.assert_array_equal(np.reshape(parts[kind], values.T.shape), values.T)
+        np.testing.assert_array_equal(np.reshape(parts["content"], (-1, steps)), run.contents.reshape(steps, -1).T)
+        band = page_of_alternatives([simulation]).episodes[0].bands
+        for kind, bands in band.items():
+            np.testing.assert_array_equal(
+                np.reshape([b.value for b in bands], (-1, steps)), np.reshape(parts[kind], (-1, steps))
+            )

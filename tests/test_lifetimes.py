@@ -240,9 +240,7 @@ def test_a_stretch_of_history_and_episode_is_a_longer_lifetime(stretch: float, g
     native = town(longer, inflow, initial=None, **kept)
     for ours, theirs in zip(lived(stretched), lived(native), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-9)
-    (ours_,), (theirs_,) = (
-        pyramids(each.network, each.rollout, each.rollout.start) for each in map(simulate, (stretched, native))
-    )
+    (ours_,), (theirs_,) = (pyramids(each.network, each.rollout) for each in map(simulate, (stretched, native)))
     np.testing.assert_allclose(ours_.mean_age, theirs_.mean_age, rtol=1e-4)
     use, other = (network.nodes[network.node_index["use"]] for network in (stretched, native))
     grown, longer_grown = (age_shares(replace(node, history=None, growth=0.05), 1.0) for node in (use, other))
@@ -343,7 +341,7 @@ def test_ages_are_those_of_cohorts(lifetime: Lifetime, stretch: float | Series) 
     env.reset(seed=0)
     start = env.rows.stocks(env.physical.stock)[:, 0].copy()
     run = rollout(env, Neutral())
-    (found,) = pyramids(network, run, start)
+    (found,) = pyramids(network, run)
     place = network.node_index["use"]
     whole = np.append(start[place], run.stock[:, place])
     np.testing.assert_allclose(found.mass.sum(axis=1), whole, rtol=2e-4)
@@ -385,10 +383,8 @@ def test_a_stretch_that_agents_set_makes_stocks_older() -> None:
     network = town(LIVES[0], np.full(30, 5.0), initial=45.0, control=control)
     env, means = MultiAgentVectorEnv(network, num_envs=1), []
     for action in (-1.0, -1 / 3, 1.0):
-        env.reset(seed=0)
-        start = env.rows.stocks(env.physical.stock)[:, 0].copy()
         run = rollout(env, Constant({"use": action}))
-        (found,) = pyramids(network, run, start)
+        (found,) = pyramids(network, run)
         np.testing.assert_allclose(found.mass.sum(axis=1)[1:], run.stock[:, 1], rtol=5e-5)
         means.append(found.mean_age[-1])
     np.testing.assert_allclose(np.array(means) / means[1], [0.5, 1.0, 2.0], rtol=0.02)
@@ -416,10 +412,8 @@ def test_the_oldest_stay_in_their_class() -> None:
     """Of what nothing is added to, all that is left is old, and none of it is lost from the pyramid."""
     network = town(LIVES[0], np.zeros(16), initial=40.0)
     env = MultiAgentVectorEnv(network, num_envs=1)
-    env.reset(seed=0)
-    start = env.rows.stocks(env.physical.stock)[:, 0].copy()
     run = rollout(env, Neutral())
-    (found,) = pyramids(network, run, start)
+    (found,) = pyramids(network, run)
     np.testing.assert_allclose(found.mass.sum(axis=1)[1:], run.stock[:, 1], rtol=1e-2)
     assert run.stock[-1, 1] < 0.1 and found.mean_age[-1] > 15
 

@@ -174,8 +174,9 @@ def test_the_page_of_a_comparison(tmp_path: Path) -> None:
     assert [scene.name for scene in story.episodes] == [USUAL, "random"]
     usual, random = story.episodes
     entry = next(each for each in found.entries if each.name == "random")
-    assert random.circularity.low is not None and (random.circularity.low < random.circularity.value).any()
-    np.testing.assert_allclose(random.circularity.value, entry.rollout.circularity_mean.mean(axis=0))
+    (band,) = random.bands["circularity"]
+    assert band.low is not None and (band.low < band.value).any()
+    np.testing.assert_allclose(band.value, entry.rollout.circularity_mean.mean(axis=0))
     np.testing.assert_array_equal(random.flow, entry.rollout.flow)
     assert usual.start is not None
     moved = entry.rollout.flow[0] @ np.array([[-1.0, 1.0, 0.0], [0.0, -1.0, 1.0]])
@@ -185,7 +186,7 @@ def test_the_page_of_a_comparison(tmp_path: Path) -> None:
     best = add_plan(page_of_comparison(found, without=["random"]), found, env)
     assert [scene.name for scene in best.episodes] == [USUAL, PLAN]
     assert found.entries[0].bound is not None
-    planned, bound = float(best.episodes[-1].circularity.value.mean()), float(found.entries[0].bound[0])
+    planned, bound = float(best.episodes[-1].bands["circularity"][0].value.mean()), float(found.entries[0].bound[0])
     assert float(entry.circularity[0]) < planned <= bound + 1e-9
     told = page_data(best)
     assert [scene["plan"] for scene in told["scenes"]] == [False, True]
@@ -202,11 +203,13 @@ def test_the_page_of_samples(tmp_path: Path) -> None:
     found = sample_episodes(load_network(path), samples=5)
     scene, *single = page_data(page_of_samples(found, "neutral"))["scenes"]
     for i, draw in enumerate(single):
-        np.testing.assert_allclose(draw["lambda"]["value"], found.circularity[i], rtol=1e-5)
-        np.testing.assert_allclose(np.array(draw["flows"]).T, found.flow[i], rtol=1e-5)
+        np.testing.assert_allclose(draw["lambda"]["value"], found.rollout.circularity_mean[i], rtol=1e-5)
+        np.testing.assert_allclose(np.array(draw["flows"]).T, found.rollout.flow[i], rtol=1e-5)
     assert len(single) == 3
     assert {values[0] for values in scene["levels"]} == {None}
-    np.testing.assert_allclose(scene["lambda"]["high"], np.quantile(found.circularity, 0.975, axis=0), rtol=1e-5)
+    np.testing.assert_allclose(
+        scene["lambda"]["high"], np.quantile(found.rollout.circularity_mean, 0.975, axis=0), rtol=1e-5
+    )
     assert scene["controls"] is None and "5 samples" in scene["about"]
 
 

@@ -97,23 +97,19 @@ def test_bands_that_are_shown_are_the_widest(monkeypatch: pytest.MonkeyPatch, tm
     """After λ and services, relative to their medians."""
     rng, shown = np.random.default_rng(), list[str]()
 
-    def quantities(drawn: object) -> Iterator[tuple[str, str, np.ndarray]]:
-        for name, width in {
-            "mean circularity": 0.1,
-            "level of served": 0.1,
-            "flow": 0.1,
-            "stock": 5.0,
-            "set": 0.0,
-        }.items():
-            yield name, "t", 100.0 + width * rng.uniform(size=(9, 2))
+    def quantities(network: Network, *kinds: str) -> Iterator[Any]:
+        widths = {"mean circularity": 0.1, "level of served": 0.1, "flow": 0.1, "stock": 5.0, "set": 0.0}
+        for name, width in widths.items():
+            values = 100.0 + width * rng.uniform(size=(9, 2))
+            yield SimpleNamespace(name=name, kind=name, unit="t", values=lambda run, values=values: values)
 
     def noted(path: Path, network: Network, panels: list[Any], **options: Any) -> Path:
         shown.extend(panel.title for panel in panels)
         return path
 
-    monkeypatch.setattr(samples, "_quantities", quantities)
+    monkeypatch.setattr(samples, "episode_quantities", quantities)
     monkeypatch.setattr(samples, "save_panels", noted)
-    drawn: Any = SimpleNamespace(network=loop())
+    drawn: Any = SimpleNamespace(network=loop(), rollout=None)
     samples.save_bands(tmp_path / "bands.png", drawn, title="")
     assert [title.lower() for title in shown] == ["mean circularity", "level of served", "stock", "flow"]
 

@@ -81,19 +81,19 @@ def simulate(
         iamc_years([(variant, name) for variant in variants for name in controls])
     options: dict[str, Any] = {"controls": controls, "constants": constants, "steps": steps, "seed": seed}
     with common.bar("simulating") as progress:
-        found = simulate_alternatives(definition, scenarios=scenarios, **options, progress=progress)
-    files = {common.stem(simulation.network, simulation.control): simulation for simulation in found}
-    if len(found) == 1:
+        simulations = simulate_alternatives(definition, scenarios=scenarios, **options, progress=progress)
+    files = {common.stem(simulation.network, simulation.control): simulation for simulation in simulations}
+    if len(simulations) == 1:
         _write_one(folder, files)
     else:
         _write_several(folder, files)
-    paths = common.browser_report(page, found)
+    paths = common.browser_report(page, simulations)
     if iamc is not None:
-        paths = [*paths, write_iamc(iamc, found)]
+        paths = [*paths, write_iamc(iamc, simulations)]
     if package is not None:
         from cirl_marl.report.data_package import write_package
 
-        paths = [*paths, write_package(package, found[0])]
+        paths = [*paths, write_package(package, simulations[0])]
     for path in paths:
         common.say(f"wrote {path}")
 
@@ -130,12 +130,8 @@ def _sample(
     title = f"{network.title or network.name}{scenario}, {controls[0]} control, {samples} samples"
     paths = write_samples(folder, common.stem(network, controls[0]), episodes, causes, title=title)
     # a few bad samples draw the mean out of the interval, so that the median stands beside it
-    figures = [("λ̄", f" {network.mass_unit}", ".5g", episodes.circularity.mean(axis=1))]
-    levels = zip(network.services, episodes.levels.mean(axis=2).T, strict=True)
-    figures += [(f"level of {service.id}", "", ".4f", level) for service, level in levels]
-    totals = zip(network.accounts, episodes.accounts.T, strict=True)
-    figures += [(account.id, f" {account.unit}", ".5g", total) for account, total in totals]
-    for name, unit, form, values in figures:
+    for name, unit_of_figure, values in episodes.figures():
+        unit, form = ("", ".4f") if unit_of_figure == "1" else (f" {unit_of_figure}", ".5g")
         low, median, high = np.quantile(values, (0.025, 0.5, 0.975)).tolist()
         spread = f"median {median:{form}}{unit}, 95 % of samples in [{low:{form}}, {high:{form}}]"
         common.say(f"{name}: {spread}; mean {values.mean():{form}}{unit}")

@@ -40,15 +40,12 @@ class Pyramid:
         return np.asarray(np.divide(self.mass @ self.ages, total, out=np.full(len(total), np.nan), where=total > 0))
 
 
-def pyramids(network: Network, run: Rollout, start: Floats) -> list[Pyramid]:
+def pyramids(network: Network, run: Rollout) -> list[Pyramid]:
     """Return the pyramid of every node with a lifetime in the first copy of an episode.
 
-    Args:
-        network: in which it was.
-        run: the episode.
-        start: stocks at its start, shape (stores,), mass; their ages are those of history or growth.
+    Ages at the start are those of history or growth.
     """
-    interval, result = network.episode.control_interval, []
+    interval, start, result = network.episode.control_interval, run.start, []
     for place, node in enumerate(network.stores):
         if node.lifetime is None:
             continue

@@ -19,10 +19,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cirl_marl.controllers.basic import Neutral
+from cirl_marl.controllers.episode_quantities import QuantityKind, episode_quantities
 from cirl_marl.controllers.rollout import Rollout, episode_start
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, unknown_name, whole_number
+from cirl_marl.errors import CirlError, check_names, whole_number
 from cirl_marl.evaluation.comparison import ProgressReport
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.compartment_model import Bools
@@ -40,6 +41,8 @@ SERVED = 1e-3
 """What a plan may lack of a service, or exceed its budget by relative to that, and count."""
 POINTS = {2: 7, 3: 4}
 """How many demands there are on each other aim, by the number of aims."""
+AIMS: tuple[QuantityKind, ...] = ("circularity", "service", "account")
+"""Kinds of what is weighed."""
 WITHIN_REACH = 1e-6
 """By how much the highest level demanded of a service is less than the highest there is, which no solver holds."""
 
@@ -71,8 +74,8 @@ class AccountFront:
     @property
     def units(self) -> tuple[str, ...]:
         """Those of the aims."""
-        units = {account.id: account.unit for account in self.network.accounts} | {CIRCULARITY: self.network.mass_unit}
-        return tuple(units.get(axis, "1") for axis in self.axes)
+        units = {figure.of or CIRCULARITY: figure.unit for figure in episode_quantities(self.network, *AIMS)}
+        return tuple(units[axis] for axis in self.axes)
 
     def at(self, demands: ArrayLike) -> Floats:
         """Return what is proved of the first, shape (n,), at other demands, shape (n, d − 1)."""
@@ -162,11 +165,8 @@ def account_front(
 
 
 def _check_axes(network: Network, axes: Sequence[str]) -> None:
-    accounts, services = ([part.id for part in parts] for parts in (network.accounts, network.services))
-    names = [CIRCULARITY, *accounts, *services]
-    for axis in axes:
-        if axis not in names:
-            raise CirlError(f"network '{network.name}': front: {unknown_name('aim', axis, names)}")
+    names = [figure.of or CIRCULARITY for figure in episode_quantities(network, *AIMS)]
+    check_names("aim", axes, names, f"network '{network.name}': front: ")
     if len(axes) not in (2, 3) or len(set(axes)) < len(axes) or CIRCULARITY in axes[1:]:
         choice = f"give two or three different accounts or services, the first of which may be '{CIRCULARITY}'"
         raise CirlError(f"front of {', '.join(axes)}: {choice}")
@@ -308,7 +308,5 @@ class _Sweep:
 
     def _coordinates(self, run: Rollout) -> list[float]:
         """Return what an episode has of each aim."""
-        of_services = zip(self._services, run.episode_levels[0].tolist(), strict=True)
-        of_accounts = zip(self._accounts, run.accounts[0].tolist(), strict=True)
-        values = {CIRCULARITY: float(run.episode_circularity[0]), **dict(of_accounts), **dict(of_services)}
-        return [values[axis] for axis in self.axes]
+        figures = {figure.of or CIRCULARITY: figure for figure in episode_quantities(self.definition, *AIMS)}
+        return [float(figures[axis].totals(run)[0]) for axis in self.axes]

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 
+from cirl_marl.controllers.episode_quantities import QuantityKind, episode_quantities
 from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record
@@ -16,7 +17,6 @@ from cirl_marl.optimum.bounds import relative
 ROUND_OFF = 1e-12
 """Share of the largest value of its kind by which a quantity may differ and yet count as the same."""
 
-QuantityKind = Literal["circularity", "service", "account", "flow", "stock"]
 NAMES: Mapping[QuantityKind, str] = {
     "circularity": "mean circularity",
     "service": "mean level of service {}",
@@ -74,29 +74,18 @@ def rank_quantities(simulations: Sequence[Simulation]) -> list[ComparedQuantity]
     The order is that of ``ComparedQuantity.rank``. Round-off is ``ROUND_OFF`` of the largest value of the same kind, or
     account.
     """
-    figures = [_figures(figures_of_one) for figures_of_one in simulations]
     quantities: list[ComparedQuantity] = []
     for kind in NAMES:
-        ids = list(dict.fromkeys(id_ for figures_of_one in figures for id_ in figures_of_one[kind]))
-        values = np.array([[figures_of_one[kind].get(id_, math.nan) for figures_of_one in figures] for id_ in ids])
-        unit = "1" if kind == "service" else simulations[0].network.mass_unit
-        units = {a.id: a.unit for s in simulations for a in s.network.accounts} if kind == "account" else {}
-        for id_, row in zip(ids, values, strict=True):
+        units: dict[str, str] = {}
+        figures: list[dict[str, float]] = []
+        for simulation in simulations:
+            episode, members = simulation.network.episode, episode_quantities(simulation.network, kind)
+            scale = episode.horizon * episode.control_interval if kind == "flow" else 1.0  # masses that moved
+            units |= {q.of: simulations[0].network.mass_unit if kind == "flow" else q.unit for q in members}
+            figures.append({q.of: float(q.totals(simulation.rollout)[0] * scale) for q in members})
+        values = np.array([[of_one.get(id_, math.nan) for of_one in figures] for id_ in units])
+        for (id_, unit), row in zip(units.items(), values, strict=True):
             alike = row if kind == "account" else values
             round_off = ROUND_OFF * float(np.abs(np.nan_to_num(alike)).max(initial=0.0))
-            quantities.append(ComparedQuantity(kind, id_, units.get(id_, unit), row, round_off))
+            quantities.append(ComparedQuantity(kind, id_, unit, row, round_off))
     return sorted(quantities, key=lambda quantity: -quantity.rank)
-
-
-def _figures(alternative: Simulation) -> dict[QuantityKind, dict[str, float]]:
-    """Return the figures of an episode by kind and id."""
-    network, run = alternative.network, alternative.rollout
-    duration = network.episode.horizon * network.episode.control_interval
-    levels, masses, stocks = run.episode_levels[0], run.mean_flow * duration, run.final_stock
-    return {
-        "circularity": {"": float(run.episode_circularity[0])},
-        "service": dict(zip((service.id for service in network.services), levels.tolist(), strict=True)),
-        "account": dict(zip((account.id for account in network.accounts), run.accounts[0].tolist(), strict=True)),
-        "flow": dict(zip((arc.id for arc in network.arcs), masses.tolist(), strict=True)),
-        "stock": dict(zip((node.id for node in network.stores), stocks.tolist(), strict=True)),
-    }

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from cirl_marl.controllers.episode_quantities import episode_quantities
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.evaluation.statistics import over_episodes
 from cirl_marl.network import Network
@@ -34,17 +35,14 @@ def ties(network: Network, rollouts: Mapping[str, Sequence[Rollout]]) -> Iterato
         network: in which they acted.
         rollouts: by row, one for each training seed, of which the mean counts.
     """
-    figures = {"λ̄": {row: np.mean([r.episode_circularity for r in runs], axis=0) for row, runs in rollouts.items()}}
-    for s, service in enumerate(network.services):
-        name = f"level of {service.id}"
-        figures[name] = {row: np.mean([r.episode_levels[:, s] for r in runs], axis=0) for row, runs in rollouts.items()}
-    for figure, samples in figures.items():
+    for figure in episode_quantities(network, "circularity", "service"):
+        samples = {row: np.mean([figure.totals(run) for run in runs], axis=0) for row, runs in rollouts.items()}
         order = sorted(samples, key=lambda row: float(samples[row].mean()))
         for lower, upper in pairwise(order):
             difference = over_episodes(samples[upper] - samples[lower])
-            scale = np.abs(samples[upper]).mean() if figure == "λ̄" else 1.0
+            scale = np.abs(samples[upper]).mean() if figure.kind == "circularity" else 1.0
             if difference.value - difference.low > max(difference.value, NEGLIGIBLE * scale):
-                yield f"{lower} and {upper} ({figure})"
+                yield f"{lower} and {upper} ({figure.total_name})"
 
 
 def concatenation(first: Rollout, second: Rollout) -> Rollout:

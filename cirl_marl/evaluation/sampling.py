@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Annotated, Any
 
 import numpy as np
 
-from cirl_marl.controllers.rollout import episode_start, first_seed, rollout
+from cirl_marl.controllers.episode_quantities import episode_quantities
+from cirl_marl.controllers.rollout import Rollout, episode_start, first_seed, rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, optional_module
 from cirl_marl.network import Floats, Network
@@ -15,7 +17,7 @@ from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.registry import named_controller
 
 FEWEST = 70
-"""SampledEpisodes from which on shares of the spread are told."""
+"""Samples from which on shares of the spread are told."""
 RESAMPLES = 200
 """Bootstrap resamples of their intervals."""
 
@@ -27,13 +29,12 @@ class SampledEpisodes:
     network: Annotated[Network, "the network, its numbers as they are stated"]
     names: Annotated[tuple[str, ...], "paths of the uncertain numbers"]
     factors: Annotated[Floats, "what was drawn, relative to what is stated, shape (samples, numbers)"]
-    circularity: Annotated[Floats, "mean of λ over each interval, shape (samples, steps), mass"]
-    levels: Annotated[Floats, "level of each service, shape (samples, services, steps)"]
-    bookings: Annotated[Floats, "amount on each account, not discounted, shape (samples, accounts, steps)"]
-    accounts: Annotated[Floats, "total of each account, discounted, shape (samples, accounts)"]
-    stock: Annotated[Floats, "stocks after each interval, shape (samples, steps, stores), mass"]
-    flow: Annotated[Floats, "mean flows of each interval, shape (samples, steps, arcs), mass/time"]
-    disturbances: Annotated[Floats, "their values in each interval, shape (samples, steps, names)"]
+    rollout: Annotated[Rollout, "what came of them: copies are samples, and stocks and flows those of all, as well"]
+
+    def figures(self) -> Iterator[tuple[str, str, Floats]]:
+        """Yield λ̄, the mean level of each service and the total of each account: name, unit, shape (samples,)."""
+        for quantity in episode_quantities(self.network, "circularity", "service", "account"):
+            yield quantity.total_name, quantity.unit, quantity.totals(self.rollout)
 
 
 @positional_record
@@ -83,8 +84,7 @@ def sample_episodes(
     first, middle = first_seed(seed), episode_start(env).initial_state
     run = rollout(env, named_controller(control), seed=first, start=middle, progress=progress, watch=keep)
     factors = env.physical.factors.T.copy()
-    figures = (run.circularity_mean, run.levels, run.bookings, run.accounts)
-    return SampledEpisodes(network, tuple(network.uncertain), factors, *figures, stock, flow, run.disturbances)
+    return SampledEpisodes(network, tuple(network.uncertain), factors, replace(run, stock=stock, flow=flow))
 
 
 def rbd_fast() -> Any:
@@ -104,18 +104,14 @@ def sensitivities(episodes: SampledEpisodes) -> list[Sensitivity]:
     if not episodes.names:
         return []  # what changes all the time is no single number
     analysis = rbd_fast()
-    count = len(episodes.circularity)
+    count = len(episodes.factors)
     if count < FEWEST:
         raise CirlError(f"{count} samples are too few to tell which number matters; take {FEWEST} or more")
     # it takes the order of the draws alone
     numbers = len(episodes.names)
     problem = {"num_vars": numbers, "names": list(episodes.names), "bounds": [[0.0, 1.0]] * numbers}
-    figures = {"λ̄": episodes.circularity.mean(axis=1)}
-    levels = episodes.levels.mean(axis=2)
-    figures |= {f"level of {service.id}": levels[:, s] for s, service in enumerate(episodes.network.services)}
-    figures |= {account.id: episodes.accounts[:, a] for a, account in enumerate(episodes.network.accounts)}
     causes = []
-    for name, values in figures.items():
+    for name, _, values in episodes.figures():
         if np.ptp(values) <= 1e-12 * np.abs(values).max(initial=0.0):
             no_share = np.full(numbers, np.nan)
             causes.append(Sensitivity(name, no_share, no_share))

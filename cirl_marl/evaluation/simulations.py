@@ -11,13 +11,14 @@ from typing import Annotated, Any
 import numpy as np
 
 from cirl_marl.controllers.basic import Controller
+from cirl_marl.controllers.episode_quantities import QuantityKind, episode_quantities
 from cirl_marl.controllers.outcome import outcome_lines
 from cirl_marl.controllers.pyramids import pyramids
 from cirl_marl.controllers.rollout import EpisodeStart, Rollout, episode_start, interval_ends
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
-from cirl_marl.network import Network
-from cirl_marl.network.calendar import labels
+from cirl_marl.network import Floats, Network
+from cirl_marl.network.calendar import time_columns
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.registry import SETTABLE, named_controller
 from cirl_marl.records.files import write_table
@@ -50,50 +51,38 @@ class Simulation:
         masses on the way, inner states that an agent may see, mean ages, what disturbed the interval, and contents of
         substances.
         """
-        env, run = self.env, self.rollout
-        lambdas = (run.circularity[0], run.circularity_mean[0])
-        flows = (*run.flow.T, *env.network.throughput(run.flow.T))
-        ages = [pyramid.mean_age for pyramid in pyramids(env.network, run, run.start)]
-        insides = (*run.load.T, *run.inner.T, *(age[1:] for age in ages), *run.disturbances[0].T)
-        contents = run.contents.reshape(len(run.contents), -1).T
-        columns = (*lambdas, run.service[0], *run.bookings[0], *run.stock.T, *flows, *insides, *contents)
-        states = [*run.start_load.tolist(), *run.start_inner.tolist(), *(float(age[0]) for age in ages)]
-        states += [None] * (run.disturbances.shape[2] + len(contents))
-        first = [*[None] * (3 + len(run.bookings[0])), *run.start.tolist(), *[None] * len(flows), *states]
-        times = np.concatenate([[0.0], interval_ends(env.network)])
-        clock = zip(times.tolist(), *labels(env.network, times)[1], strict=True)
-        rows = [first, *zip(*(column.tolist() for column in columns), strict=True)]
-        return self._header(), [[*at, *figures] for at, figures in zip(clock, rows, strict=True)]
+        network, run, dynamics = self.network, self.rollout, self.env.dynamics
+        mass, time, lines, inner = network.mass_unit, network.time_unit, dynamics.batches.lines, dynamics.inner
 
-    def _header(self) -> list[str]:
-        network, physics = self.network, self.env.dynamics.inner
-        mass, time = network.mass_unit, network.time_unit
-        header = [f"time ({time})", *(f"{calendar} at the end" for calendar in labels(network, 0.0)[0])]
-        header += [f"circularity at the end ({mass})", f"mean circularity ({mass})", "service level"]
-        header += [f"{account.id} ({account.unit})" for account in network.accounts]
-        header += [f"stock of {node.id} ({mass})" for node in network.stores]
-        header += [f"flow of {arc.id} ({mass}/{time})" for arc in network.arcs]
-        header += [f"throughput of {node.id} ({mass}/{time})" for node in network.nodes if not node.stores]
-        header += [f"mass on {line.id} ({mass})" for line in self.env.dynamics.batches.lines]
-        header += [physics.names[row] for row in physics.visible]
-        header += [f"mean age of {node.id} ({time})" for node in network.stores if node.lifetime is not None]
-        contents = [name for part in network.substances for name in content_columns(network, part.id)]
-        return [*header, *disturbance_columns(network), *contents]
+        def columns(*kinds: QuantityKind) -> Iterator[tuple[str, float | None, Floats]]:
+            """Yield heading, value at the start and values in the intervals of each quantity of some kinds."""
+            for quantity in episode_quantities(network, *kinds):
+                first = float(run.start[quantity.place]) if quantity.kind == "stock" else None
+                yield quantity.heading, first, quantity.values(run)[0]
+
+        through = zip(
+            [node.id for node in network.nodes if not node.stores], network.throughput(run.flow.T), strict=True
+        )
+        loads = zip([line.id for line in lines], run.start_load.tolist(), run.load.T, strict=True)
+        table: list[tuple[str, float | None, Floats]] = [
+            (f"circularity at the end ({mass})", None, run.circularity[0]),
+            *columns("circularity"),
+            ("service level", None, run.service[0]),
+            *columns("account", "stock", "flow"),
+            *((f"throughput of {id_} ({mass}/{time})", None, flow) for id_, flow in through),
+            *((f"mass on {id_} ({mass})", first, load) for id_, first, load in loads),
+            *zip([inner.names[row] for row in inner.visible], run.start_inner.tolist(), run.inner.T, strict=True),
+            *((f"mean age of {p.node} ({time})", float(p.mean_age[0]), p.mean_age[1:]) for p in pyramids(network, run)),
+            *columns("disturbance", "content"),
+        ]
+        header, clock = time_columns(network, np.append(0.0, interval_ends(network)))
+        rows = zip(*([first, *values.tolist()] for _, first, values in table), strict=True)
+        headings = [*header, *(heading for heading, _, _ in table)]
+        return headings, [[*at, *figures] for at, figures in zip(clock, rows, strict=True)]
 
     def write(self, path: str | Path) -> Path:
         """Write ``table`` to a CSV file, whole or not at all, and return its path; missing folders are made."""
         return write_table(Path(path), *self.table())
-
-
-def disturbance_columns(network: Network) -> list[str]:
-    """Return headers of the values of disturbances, with their units."""
-    processes = network.processes
-    return [f"disturbance {n} ({d.unit})" for n, d in zip(processes.names, processes.disturbances, strict=True)]
-
-
-def content_columns(network: Network, substance: str) -> list[str]:
-    """Return the names of the columns of tables that have the content of a substance in nodes and flows."""
-    return [f"{substance} in {id_} (1)" for id_ in network.compartments]
 
 
 def simulate(

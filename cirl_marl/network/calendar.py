@@ -54,8 +54,7 @@ def years(network: Specification, time: ArrayLike) -> Floats:
     """Return times since the start of an episode as calendar years; the network must have a start."""
     start = network.episode.start
     assert start is not None
-    calendar_years: Floats = year(start) + np.asarray(time, dtype=np.float64) * factor(network.time_unit, "year")
-    return calendar_years
+    return year(start) + np.asarray(time, dtype=np.float64) * factor(network.time_unit, "year")
 
 
 def labels(network: Specification, time: ArrayLike) -> tuple[list[str], list[list[str]]]:
@@ -69,6 +68,16 @@ def labels(network: Specification, time: ArrayLike) -> tuple[list[str], list[lis
     dates = [_clock(start) + timedelta(seconds=round(moment)) for moment in seconds.tolist()]
     whole = all(moment.time() == moment.min.time() for moment in dates)
     return ["date"], [[moment.isoformat(" ", "minutes")[: 10 if whole else None] for moment in dates]]
+
+
+def time_columns(network: Specification, times: Floats) -> tuple[list[str], list[list[object]]]:
+    """Return header and cells of the first columns of tables over time: the time, and the year or date if there is one.
+
+    ``times`` are ends of intervals; there is a row of cells for each.
+    """
+    calendar, dates = labels(network, times)
+    header = [f"time ({network.time_unit})", *(f"{name} at the end" for name in calendar)]
+    return header, [list(row) for row in zip(times.tolist(), *dates, strict=True)]
 
 
 def _clock(moment: YearOrDate) -> datetime:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from cirl_marl.controllers.basic import Arrays, Controller
+from cirl_marl.controllers.episode_quantities import QuantityKind, episode_quantities
 from cirl_marl.controllers.rollout import episode_start, first_seed, rollout
 from cirl_marl.controllers.schedule import control_names
 from cirl_marl.definitions.data_files import CsvRows, number_in
@@ -18,7 +19,6 @@ from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RunError, unknown_name
-from cirl_marl.evaluation.simulations import content_columns
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum.options import by_stage
@@ -120,10 +120,9 @@ class _Table:
 
 
 def _simulated_episode(network: Network, table: _Table) -> PlannedEpisode:
-    mass = network.mass_unit
     table.check_steps(network, len(table.rows) - 1)
-    stocks = [f"stock of {node.id} ({mass})" for node in network.stores]
-    flows = [f"flow of {arc.id} ({mass}/{network.time_unit})" for arc in network.arcs]
+    kinds: tuple[QuantityKind, ...] = ("stock", "flow", "content")
+    stocks, flows, contents = ([q.heading for q in episode_quantities(network, kind)] for kind in kinds)
     for name in table.header:
         if name.startswith(("stock of ", "flow of ")) and name not in {*stocks, *flows}:
             columns = sorted({*stocks, *flows})
@@ -131,11 +130,9 @@ def _simulated_episode(network: Network, table: _Table) -> PlannedEpisode:
     stock = np.array([table.column(name) for name in stocks]).T
     flow = np.array([table.column(name, 1) for name in flows]).T
     initial = by_stage(network, StateLayout(simulated_network(network)), stock[0])
-    contents = [
-        [table.column(name, 1) for name in content_columns(network, substance.id)] for substance in network.substances
-    ]
     shape = (len(network.substances), len(network.compartments), len(flow))
-    return PlannedEpisode(str(table.path), initial, stock[1:], flow, np.moveaxis(np.reshape(contents, shape), 2, 0))
+    parts = np.reshape([table.column(name, 1) for name in contents], shape)
+    return PlannedEpisode(str(table.path), initial, stock[1:], flow, np.moveaxis(parts, 2, 0))
 
 
 class _TableController(Controller):

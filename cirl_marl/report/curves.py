@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from cirl_marl.controllers.rollout import Rollout, interval_ends
 from cirl_marl.drawing.style import (
     DASHES,
     FAINT,
@@ -20,13 +21,12 @@ from cirl_marl.drawing.style import (
     SERIES,
     WIDTH,
     axis_time,
-    check_shape,
     readable,
     save,
     style_axes,
     time_axis,
 )
-from cirl_marl.errors import CirlError
+from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.evaluation.statistics import mean_interval
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import Law
@@ -51,38 +51,24 @@ class PointSeries:
     is_line: bool = False
 
 
-def save_circularity(
-    path: str | Path,
-    network: Network,
-    time: Floats,
-    runs: Mapping[str, Floats],
-    services: Mapping[str, Floats],
-    *,
-    title: str = "",
-) -> Path:
+def save_circularity(path: str | Path, network: Network, runs: Mapping[str, Rollout], *, title: str = "") -> Path:
     """Save λ over time and, below it, the service level of several controls as a PNG and return its path.
 
-    Lines are means over episodes; bands are the 95 % confidence intervals of the means (Student's t), where
-    there are at least two episodes.
-
-    ``runs`` are means of λ over the intervals, mass, and ``services`` service levels by control, of shape
-    (episodes, steps), ``time`` the ends of the intervals, (steps,); other shapes raise a ``CirlError``.
+    Lines are means over the episodes of ``runs``, by control; bands are the 95 % confidence intervals of the means
+    (Student's t), where there are at least two episodes.
     """
-    time = axis_time(time - network.episode.control_interval / 2, network)
+    time = axis_time(interval_ends(network) - network.episode.control_interval / 2, network)
     figure = Figure(figsize=(WIDTH, 5.4), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.7, 1))
-    names = list(dict.fromkeys([*runs, *services]))
-    for axes, curves, top in ((above, runs, math.inf), (below, services, 1.0)):
-        for name, values in curves.items():
-            _draw_mean(axes, time, _check_length(name, values, time), name, names.index(name), top=top)
+    for place, (name, run) in enumerate(runs.items()):
+        _draw_mean(above, time, run.circularity_mean, name, place)
+        _draw_mean(below, time, run.service, name, place, top=1.0)
     subject = "Mean circularity of each step, averaged over episodes, with 95 % intervals"
     style_axes(above, title=title or subject, ylabel=f"λ / {network.mass_unit}")
     style_axes(below, title="Service level", ylabel="service level")
     below.set_ylim(-0.03, 1.06)
     time_axis(below, time, network)
-    if names:
-        lines, labels = (above if runs else below).get_legend_handles_labels()
-        figure.legend(lines, labels, loc="outside upper right", ncols=4, frameon=False, fontsize=9)
+    figure.legend(*above.get_legend_handles_labels(), loc="outside upper right", ncols=4, frameon=False, fontsize=9)
     return save(figure, path)
 
 
@@ -91,7 +77,7 @@ def save_learning_curves(path: str | Path, steps: Floats, returns: Mapping[str, 
 
     Raw returns are light, their centred moving average over a fifteenth of the episodes is bold. Of more
     than 20 agents the first 20 are shown. ``steps`` are environment steps at the end of each episode, and ``returns``
-    those of episodes by agent, shape (episodes,) each; other shapes raise a ``CirlError``.
+    those of episodes by agent, shape (episodes,) each.
     """
     agents = list(returns.items())[:AGENT_PANELS]
     columns = max(1, min(len(agents), 3 if len(agents) <= 9 else 4))
@@ -99,7 +85,7 @@ def save_learning_curves(path: str | Path, steps: Floats, returns: Mapping[str, 
     figure = Figure(figsize=(WIDTH, 0.7 + max(1.7 * rows, 2.6)), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False, sharex=True).ravel()
     for axes, (agent, values) in zip(panels, agents, strict=False):
-        _draw_returns(axes, steps, _check_length(agent, values, steps))
+        _draw_returns(axes, steps, values)
         style_axes(axes, title=readable(agent), size=8.0)
         axes.locator_params(nbins=4)
     for axes in panels[len(agents) :]:
@@ -113,67 +99,35 @@ def save_learning_curves(path: str | Path, steps: Floats, returns: Mapping[str, 
     return save(figure, path)
 
 
-def save_trajectory(
-    path: str | Path,
-    network: Network,
-    time: Floats,
-    stock: Floats,
-    flow: Floats,
-    circularity: Floats,
-    *,
-    start: Floats | None = None,
-    load: Floats | None = None,
-    service: Floats | None = None,
-    title: str = "",
-) -> Path:
-    """Save stocks, flows, λ and service level over time as a PNG and return its path.
+def save_trajectory(path: str | Path, simulation: Simulation, *, title: str = "") -> Path:
+    """Save λ, service level, stocks and flows of a simulated episode over time as a PNG and return its path.
 
     Stocks that are ten times smaller than others have a panel of their own. Of more than 10 compartments in a panel,
     those that change most are shown.
-
-    Args:
-        path: file to write; its folder is made.
-        network: the network.
-        time: ends of the intervals, shape (steps,), time.
-        stock: stocks, shape (stores, steps), mass.
-        flow: mean flows of each interval, shape (arcs, steps), mass/time.
-        circularity: mean λ of each interval, shape (steps,), mass.
-        start: stocks before the first step, then masses on batch arcs if ``load`` is given, mass; None leaves them out.
-        load: masses on batch arcs, shape (batch arcs, steps), mass; None leaves them out.
-        service: service level, shape (steps,); None leaves it out.
-        title: heading.
-
-    Raises:
-        CirlError: if an array has the wrong shape.
     """
-    steps, mass = (len(time),), network.mass_unit
-    stock = check_shape("stock", stock, (len(network.stores), *steps))
-    flow = check_shape("flow", flow, (len(network.arcs), *steps))
-    circularity = check_shape("circularity", circularity, steps)
-    labels = [node.label for node in network.stores]
-    if load is not None:
-        on_the_way = [arc.id for arc in network.arcs if arc.law is Law.BATCH]
-        labels += [f"on {network.compartments[arc].label}" for arc in on_the_way]
-        stock = np.concatenate([stock, check_shape("load", load, (len(on_the_way), *steps))])
+    network, run, mass = simulation.network, simulation.rollout, simulation.network.mass_unit
+    on_the_way = [network.compartments[arc.id].label for arc in network.arcs if arc.law is Law.BATCH]
+    labels = [*(node.label for node in network.stores), *(f"on {label}" for label in on_the_way)]
+    stock = np.vstack([np.append(run.start, run.start_load), np.column_stack([run.stock, run.load])]).T
     # what is a mean over an interval stands in its middle, a stock at its end
-    middle, stock_times = (axis_time(times, network) for times in (time - network.episode.control_interval / 2, time))
-    if start is not None:
-        stock = np.column_stack([check_shape("start", start, (len(stock),)), stock])
-        stock_times = np.concatenate([axis_time(np.zeros(1), network), stock_times])
+    ends, interval = interval_ends(network), network.episode.control_interval
+    middle, stock_times = (axis_time(times, network) for times in (ends - interval / 2, np.append(0.0, ends)))
     groups = _by_scale(np.abs(np.nan_to_num(stock)).max(axis=1, initial=0.0))
-    heights = [1.25 if len(groups) == 1 else 0.9] * len(groups) + [1.25, 0.8, *([] if service is None else [0.5])]
+    heights = [1.25 if len(groups) == 1 else 0.9] * len(groups) + [1.25, 0.8, *([0.5] if network.services else [])]
     figure = Figure(figsize=(WIDTH, 2.5 * sum(heights)), layout="constrained")
-    figure.suptitle(title, fontsize=11, fontweight="bold")
+    heading = title or f"{network.title or network.name}, {simulation.control}"
+    figure.suptitle(heading, fontsize=11, fontweight="bold")
     panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
     for place, (axes, rows) in enumerate(zip(panels, groups, strict=False)):
         name = "Stocks" if place == 0 else "Smaller stocks" if place == 1 else "The smallest stocks"
         _draw_largest(axes, stock_times, stock[rows], [labels[row] for row in rows], name, mass)
     flows, lambdas = panels[len(groups) : len(groups) + 2]
-    _draw_largest(flows, middle, flow, [arc.label for arc in network.arcs], "Mean flows", f"{mass}/{network.time_unit}")
-    _draw_mean(lambdas, middle, circularity, "", 0)
+    arcs, unit = [arc.label for arc in network.arcs], f"{mass}/{network.time_unit}"
+    _draw_largest(flows, middle, run.flow.T, arcs, "Mean flows", unit)
+    _draw_mean(lambdas, middle, run.circularity_mean[:1], "", 0)
     style_axes(lambdas, title="Mean circularity", ylabel=f"λ / {mass}")
-    if service is not None:
-        _draw_mean(panels[-1], middle, check_shape("service", service, steps), "", 0)
+    if network.services:
+        _draw_mean(panels[-1], middle, run.service[:1], "", 0)
         style_axes(panels[-1], title="Service level", ylabel="service level")
         panels[-1].set_ylim(-0.03, 1.06)
     time_axis(panels[-1], stock_times, network)
@@ -216,26 +170,17 @@ def _widen(axes: Axes) -> None:
             set_limits(low - gap / 2, high + gap / 2)
 
 
-def _check_length(name: str, values: Floats, time: Floats) -> Floats:
-    numbers = np.asarray(values, dtype=float)
-    if numbers.ndim not in (1, 2) or numbers.shape[-1] != len(time):
-        raise CirlError(f"'{name}' has shape {numbers.shape}, expected {len(time)} along the last axis")
-    return numbers
-
-
 def _dots(time: Floats) -> str:
     """A single point makes no line: mark it."""
     return "o" if len(time) == 1 else ""
 
 
 def _draw_mean(axes: Axes, time: Floats, values: Floats, name: str, index: int, top: float = math.inf) -> None:
-    episodes = np.atleast_2d(values)
-    if not len(episodes):
-        return
+    """Draw the mean of episodes, shape (episodes, steps), with its interval, which ends at ``top``."""
     colour, dash = SERIES[index % len(SERIES)], DASHES[index % len(DASHES)]
-    mean, low, high = mean_interval(episodes, (-math.inf, top))
+    mean, low, high = mean_interval(values, (-math.inf, top))
     axes.plot(time, mean, color=colour, linestyle=dash, linewidth=1.8, label=readable(name), marker=_dots(time))
-    if len(episodes) > 1:
+    if len(values) > 1:
         axes.fill_between(time, low, high, color=colour, alpha=0.2, linewidth=0)
 
 

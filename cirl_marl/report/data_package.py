@@ -9,16 +9,17 @@ Reference: Frictionless Data, Data Package version 2 (datapackage.org).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 
+from cirl_marl.controllers.episode_quantities import QuantityKind, episode_quantities
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.definitions.data_files import CsvRows, number_in
 from cirl_marl.definitions.reader import write_network
-from cirl_marl.errors import CirlError, instance_of, unknown_name
+from cirl_marl.errors import CirlError, check_names, instance_of, unknown_name
 from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declarations import positional_record
@@ -90,7 +91,6 @@ def write_package(folder: str | Path, simulation: Simulation) -> Path:
 def _tables(simulation: Simulation) -> dict[str, tuple[list[TableField], Iterable[Sequence[object]]]]:
     """Return the fields and rows of each table, by name."""
     network, run, ledger = simulation.network, simulation.rollout, simulation.env.ledger
-    steps, stocks = range(len(run.flow)), np.concatenate([run.start[None], run.stock])
     pairs = zip(ledger.account.tolist(), ledger.compartments, strict=True)
     entries = [(network.accounts[account], compartment) for account, compartment in pairs]
     mass, interval = network.mass_unit, ("interval", "integer", "counted from 0")
@@ -99,13 +99,14 @@ def _tables(simulation: Simulation) -> dict[str, tuple[list[TableField], Iterabl
     kinds = [("role", "string", "in the circular economy"), ("stores", "boolean", "whether it has a stock")]
     ends = [("from", "string", "node that gives"), ("to", "string", "node that receives")]
     part = ("content", "number", "part of the mass: of a stock after the interval, of a flow in it")
-    contents = {
-        f"content_{substance.id}": (
-            [interval, ("compartment", "string", "id"), part],
-            [[t, id_, run.contents[t, s, c]] for t in steps for c, id_ in enumerate(network.compartments)],
-        )
-        for s, substance in enumerate(network.substances)
-    }
+
+    def rows(kind: QuantityKind, substance: str = "") -> Iterator[list[object]]:
+        """Yield interval, id and value of all quantities of a kind, stocks from the start on."""
+        members = [member for member in episode_quantities(network, kind) if member.substance == substance]
+        curves = (member.points(network, run)[1].tolist() for member in members)
+        for t, values in enumerate(zip(*curves, strict=True)):
+            yield from ([t, member.of, value] for member, value in zip(members, values, strict=True))
+
     account = [("account", "string", "id"), ("compartment", "string", "of it"), ("unit", "string", "of amounts")]
     return {
         "nodes": (
@@ -118,25 +119,31 @@ def _tables(simulation: Simulation) -> dict[str, tuple[list[TableField], Iterabl
         ),
         "stocks": (
             [begin, ("node", "string", "id"), ("stock", "number", mass)],
-            ([t, n.id, stocks[t, i]] for t in range(len(stocks)) for i, n in enumerate(network.stores)),
+            rows("stock"),
         ),
         "flows": (
             [interval, ("arc", "string", "id"), ("flow", "number", f"{mass}/{network.time_unit}, mean")],
-            ([t, a.id, run.flow[t, k]] for t in steps for k, a in enumerate(network.arcs)),
+            rows("flow"),
         ),
         "services": (
             [interval, ("service", "string", "id"), ("level", "number", "part of what is demanded")],
-            ([t, s.id, run.levels[0, i, t]] for t in steps for i, s in enumerate(network.services)),
+            rows("service"),
         ),
         "circularity": (
             [interval, ("circularity", "number", f"{mass}, mean of λ")],
-            ([t, run.circularity_mean[0, t]] for t in steps),
+            ([t, value] for t, _, value in rows("circularity")),
         ),
         "accounts": (
             [interval, *account, ("amount", "number", "not discounted")],
-            ([t, a.id, id_, a.unit, run.entries[t, e]] for t in steps for e, (a, id_) in enumerate(entries)),
+            ([t, a.id, id_, a.unit, row[e]] for t, row in enumerate(run.entries) for e, (a, id_) in enumerate(entries)),
         ),
-        **contents,
+        **{
+            f"content_{substance.id}": (
+                [interval, ("compartment", "string", "id"), part],
+                rows("content", substance.id),
+            )
+            for substance in network.substances
+        },
     }
 
 
@@ -154,8 +161,7 @@ def read_package(folder: str | Path) -> EpisodePackage:
 
     def table(name: str, columns: Sequence[str], ids: Sequence[str], first: int = 0) -> Floats:
         """Return the numbers of a table by interval and the ids of a column."""
-        if name not in names:
-            raise CirlError(f"{folder / PACKAGE}: resources: {unknown_name('table', name, names)}")
+        check_names("table", [name], names, f"{folder / PACKAGE}: resources: ")
         return _numbers(folder / f"{name}.csv", columns, ids, network.episode.horizon + first)
 
     def ids(parts: Iterable[Any]) -> list[str]:
@@ -188,9 +194,7 @@ def _numbers(path: Path, columns: Sequence[str], ids: Sequence[str], intervals: 
     adds = columns[0] == "account"
     rows = CsvRows(str(path), read_content(path))
     header, numbers = rows[0], np.full((intervals, len(ids)), 0.0 if adds else np.nan)
-    for column in filter(None, ("interval", *columns)):
-        if column not in header:
-            raise CirlError(f"{path}: {unknown_name('column', column, header)}")
+    check_names("column", filter(None, ("interval", *columns)), header, f"{path}: ")
     places = [header.index(column) for column in ("interval", *columns) if column]
     rank = {id_: place for place, id_ in enumerate(ids)}
     for line, cells in zip(rows.lines[1:], rows.columns(places), strict=True):

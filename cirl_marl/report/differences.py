@@ -12,12 +12,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from rich.table import Table
 
-from cirl_marl.controllers.rollout import interval_ends
+from cirl_marl.controllers.episode_quantities import episode_quantities
 from cirl_marl.drawing.style import DASHES, SERIES, axis_time, readable
 from cirl_marl.evaluation.compared_quantities import ComparedQuantity, rank_quantities
 from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.evaluation.statistics import finite_or_none
-from cirl_marl.network import Floats
 from cirl_marl.records.files import publish_result
 from cirl_marl.report.panels import LEVELS, PANELS, Panel, save_panels
 from cirl_marl.report.terminal import text_table
@@ -103,24 +102,9 @@ def save_alternatives(
 
 def _draw(axes: Axes, simulations: Sequence[Simulation], quantity: ComparedQuantity) -> None:
     for i in np.flatnonzero(~np.isnan(quantity.values)).tolist():
-        time, values = _trajectory(simulations[i], quantity)
+        network, run = simulations[i].network, simulations[i].rollout
+        (curve,) = [part for part in episode_quantities(network, quantity.kind) if part.of == quantity.of]
+        time, values = curve.points(network, run)
         dash = DASHES[(i + i // len(SERIES)) % len(DASHES)]  # colours come round before pairs do
         look: Any = {"color": SERIES[i % len(SERIES)], "linestyle": dash, "marker": "o" if len(time) == 1 else ""}
         axes.plot(axis_time(time, simulations[0].network), values, label=simulations[i].name, **look)
-
-
-def _trajectory(simulation: Simulation, quantity: ComparedQuantity) -> tuple[Floats, Floats]:
-    """Return times and values, shape (points,) each: means in the middle of an interval, stocks at start and ends."""
-    network, episode = simulation.network, simulation.rollout
-    ends = interval_ends(network)
-    middle = ends - network.episode.control_interval / 2
-    if quantity.kind == "circularity":
-        return middle, episode.circularity_mean[0]
-    if quantity.kind == "service":
-        return middle, episode.levels[0, [service.id for service in network.services].index(quantity.of)]
-    if quantity.kind == "account":
-        return middle, episode.bookings[0, [account.id for account in network.accounts].index(quantity.of)]
-    if quantity.kind == "flow":
-        return middle, episode.flow[:, network.arc_index[quantity.of]]
-    row = network.node_index[quantity.of]  # nodes with a stock come first
-    return np.append(0.0, ends), np.append(episode.start[row], episode.stock[:, row])

@@ -14,10 +14,11 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 
+from cirl_marl.controllers.episode_quantities import EpisodeQuantity, QuantityKind, episode_quantities
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.definitions.data_files import CsvRows, number_in
 from cirl_marl.dynamics.ledger import Ledger
@@ -31,6 +32,15 @@ from cirl_marl.records.machine import versions
 
 WORLD = "World"
 """The region of what is of no copy and no region."""
+VARIABLES: Mapping[QuantityKind, str] = {
+    "circularity": "Circularity",
+    "service": "Service Level|{}",
+    "stock": "Stock|{}",
+    "flow": "Flow|{}",
+    "content": "Content|{substance}|{}",
+}
+OF_NETWORK = ("circularity", "service")
+"""Kinds of quantities that are of no compartment."""
 NAMES = ("Model", "Scenario", "Region", "Variable", "Unit")
 YearlyRow = tuple[list[str], Callable[[Rollout], Floats]]
 """The first columns of a row, and what its values are of an episode, shape (steps,)."""
@@ -136,41 +146,31 @@ def _years(network: Network) -> range:
 def _series(network: Network, control: str) -> Iterator[YearlyRow]:
     """Give the rows of an episode."""
     ledger = Ledger(network.with_options(episode={"horizon": 1}))  # entries are the same in every interval
-    model, mass = f"cirl_marl {versions()['cirl-marl']}", network.mass_unit
-    scenario = f"{network.name} {network.scenario_name} {control}"
+    case = f"cirl_marl {versions()['cirl-marl']}", f"{network.name} {network.scenario_name} {control}"
     own = network.region or WORLD
     scale = elapsed_time(2001, 2000, network.time_unit)
-
-    def row(region: str, variable: str, unit: str, values: Callable[[Rollout], Floats]) -> YearlyRow:
-        return [model, scenario, region, variable, unit], values
-
-    def at(place: Any, values: Callable[[Rollout, Any], Floats]) -> Callable[[Rollout], Floats]:
-        return lambda run: values(run, place)
 
     def place(id_: str) -> tuple[str, str]:
         """Return the region of a compartment, and its name there."""
         name = network.counterpart(id_)
         return (own, id_) if name is None else (network.region_of(id_), name)
 
-    yield row(own, "Circularity", mass, lambda run: run.circularity_mean[0])
-    for s, service in enumerate(network.services):
-        yield row(own, f"Service Level|{service.id}", "1", at(s, lambda run, s: run.levels[0, s]))
-    for i, node in enumerate(network.stores):
-        region, name = place(node.id)
-        yield row(region, f"Stock|{name}", mass, at(i, lambda run, i: run.stock[:, i]))
-    for k, arc in enumerate(network.arcs):
-        region, name = place(arc.id)
-        yield row(region, f"Flow|{name}", f"{mass}/yr", at(k, lambda run, k: run.flow[:, k] * scale))
-    for s, substance in enumerate(network.substances):
-        for c, id_ in enumerate(network.compartments):
-            region, name = place(id_)
-            content = at((s, c), lambda run, pair: run.contents[:, *pair])
-            yield row(region, f"Content|{substance.id}|{name}", "1", content)
-    for a, account in enumerate(network.accounts):
+    def of_quantity(quantity: EpisodeQuantity, factor: float = 1.0) -> Callable[[Rollout], Floats]:
+        return lambda run: quantity.values(run)[0] * factor
+
+    def of_entries(entries: list[int]) -> Callable[[Rollout], Floats]:
+        return lambda run: np.asarray(run.entries[:, entries].sum(axis=1))
+
+    for quantity in episode_quantities(network, *VARIABLES):
+        region, name = (own, quantity.of) if quantity.kind in OF_NETWORK else place(quantity.of)
+        variable, is_flow = VARIABLES[quantity.kind].format(name, substance=quantity.substance), quantity.kind == "flow"
+        unit, factor = (f"{network.mass_unit}/yr", scale) if is_flow else (quantity.unit, 1.0)
+        yield [*case, region, variable, unit], of_quantity(quantity, factor)
+    for total, account in zip(episode_quantities(network, "account"), network.accounts, strict=True):
         title, unit = account.title or account.id, f"{account.unit}/yr"
-        yield row(own, title, unit, at(a, lambda run, a: run.bookings[0, a]))
+        yield [*case, own, title, unit], of_quantity(total)
         parts: dict[tuple[str, str], list[int]] = {}
-        for entry in np.flatnonzero(ledger.account == a).tolist():
+        for entry in np.flatnonzero(ledger.account == total.place).tolist():
             parts.setdefault(place(ledger.compartments[entry]), []).append(entry)
-        for (region, name), entries in parts.items():
-            yield row(region, f"{title}|{name}", unit, at(entries, lambda run, rows: run.entries[:, rows].sum(axis=1)))
+        for (region, name), rows in parts.items():
+            yield [*case, region, f"{title}|{name}", unit], of_entries(rows)

@@ -9,7 +9,6 @@ from typing import Any, TypeVar
 import numpy as np
 from rich.console import Group, RenderableType
 
-from cirl_marl.controllers.rollout import interval_ends
 from cirl_marl.controllers.schedule import Schedule
 from cirl_marl.drawing.digraph import save_before_after
 from cirl_marl.errors import CirlError
@@ -19,14 +18,13 @@ from cirl_marl.evaluation.levers import Levers
 from cirl_marl.evaluation.pareto import ParetoFront
 from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.report import report_page
-from cirl_marl.report.curves import save_circularity, save_learning_curves
+from cirl_marl.report.curves import save_circularity, save_learning_curves, save_trajectory
 from cirl_marl.report.decisions import decisions_table, save_decisions, savings_table
 from cirl_marl.report.differences import save_alternatives
 from cirl_marl.report.lever_chart import levers_table, save_levers
 from cirl_marl.report.page_html import write_page
 from cirl_marl.report.terminal import evaluation_table
 from cirl_marl.report.tradeoffs import comparison_notes, comparison_table, save_comparison, save_pareto
-from cirl_marl.report.trajectory import draw_trajectory
 
 Reportable = Simulation | Sequence[Simulation] | Schedule | Comparison | ParetoFront | Evaluation
 """What ``simulate``, ``simulate_alternatives``, ``plan``, ``compare``, ``pareto_front`` and ``evaluate`` return."""
@@ -91,10 +89,7 @@ def draw_run(evaluation: Evaluation) -> list[Path]:
 
 def draw_circularity(path: Path, evaluation: Evaluation, *, title: str = "") -> Path:
     """Save λ and service level over time, trained beside neutral and random control, as a PNG; return its path."""
-    network, rollouts = evaluation.env.network, evaluation.rollouts
-    means = {name: rollout.circularity_mean for name, rollout in rollouts.items()}
-    services = {name: rollout.service for name, rollout in rollouts.items()}
-    return save_circularity(path, network, interval_ends(network), means, services, title=title)
+    return save_circularity(path, evaluation.env.network, evaluation.rollouts, title=title)
 
 
 def summarise(result: object) -> RenderableType:
@@ -123,7 +118,7 @@ _PAGES: Mapping[type, Callable[[Any], report_page.ReportPage]] = {
     Evaluation: report_page.page_of_evaluation,
 }
 _PICTURES: Mapping[type, Callable[..., Path]] = {
-    Simulation: draw_trajectory,
+    Simulation: save_trajectory,
     Sequence: save_alternatives,
     Schedule: save_decisions,
     Comparison: save_comparison,

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
+from cirl_marl.controllers.episode_quantities import EpisodeQuantity, QuantityKind, episode_quantities
 from cirl_marl.controllers.indicators import indicators
 from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.controllers.schedule import Schedule
@@ -29,6 +30,8 @@ from cirl_marl.report.samples import SHOWN
 from cirl_marl.report.tradeoffs import worst_notes
 
 QUANTILES = (0.025, 0.5, 0.975)
+BANDS: tuple[QuantityKind, ...] = ("circularity", "service", "disturbance", "account")
+"""Kinds of quantities that have bands."""
 USUAL, PLAN = "business as usual", "plan of the bound"
 CONFIDENCE = "mean of {} episodes, with its 95 % interval"
 SAMPLES = "median of {} samples, and what 95 % of them lie within"
@@ -54,14 +57,11 @@ class PageEpisode:
     stock: Annotated[Floats, "stocks at the end of each interval, shape (steps, stores), mass"]
     flow: Annotated[Floats, "mean flows of each interval, shape (steps, arcs), mass/time"]
     controls: Annotated[Floats | None, "values of all controls, shape (steps, controls); None if they are not known"]
-    circularity: Annotated[Band, "mean of λ over each interval, mass"]
-    levels: Annotated[tuple[Band, ...], "level of each service"]
+    bands: Annotated[Mapping[QuantityKind, tuple[Band, ...]], "of λ, services, disturbances and accounts, by kind"]
     about: Annotated[str, "what the bands are; empty if there are none"] = ""
     figures: Annotated[Mapping[str, Aggregate | None], "figures of whole episodes, of ``comparison.FIGURES``"] = field(
         default_factory=dict
     )
-    disturbances: Annotated[tuple[Band, ...], "values of each disturbance"] = ()
-    accounts: Annotated[tuple[Band, ...], "amount on each account in each interval"] = ()
     contents: Annotated[
         Floats | None, "of each substance in nodes and flows, shape (steps, substances, compartments); None: not known"
     ] = None
@@ -106,35 +106,24 @@ def page_of_samples(samples: SampledEpisodes, control: str) -> ReportPage:
 
     Flows and stocks are means, which balance as medians do not.
     """
-    network, count = samples.network, len(samples.circularity)
+    network, run, count = samples.network, samples.rollout, len(samples.factors)
     episode = PageEpisode(
         name=readable(control),
         network=network,
         agents=network.agents,
         start=None,
-        stock=samples.stock.mean(axis=0),
-        flow=samples.flow.mean(axis=0),
+        stock=run.stock.mean(axis=0),
+        flow=run.flow.mean(axis=0),
         controls=None,
-        circularity=_quantiles(samples.circularity),
-        levels=tuple(_quantiles(samples.levels[:, s]) for s in range(len(network.services))),
+        bands=_bands(network, run, lambda quantity, values: _quantiles(values)),
         about=SAMPLES.format(count),
-        disturbances=tuple(map(_quantiles, np.moveaxis(samples.disturbances, 2, 0))),
-        accounts=tuple(map(_quantiles, np.moveaxis(samples.bookings, 1, 0))),
     )
-    draws = tuple(
-        replace(
-            episode,
-            name=f"sample {i}",
-            stock=samples.stock[i],
-            flow=samples.flow[i],
-            circularity=Band(samples.circularity[i]),
-            levels=tuple(map(Band, samples.levels[i])),
-            about="",
-            disturbances=tuple(map(Band, samples.disturbances[i].T)),
-            accounts=tuple(map(Band, samples.bookings[i])),
-        )
-        for i in range(min(SHOWN, count))
-    )
+
+    def draw(i: int) -> PageEpisode:
+        bands = _bands(network, run, lambda quantity, values: Band(values[i]))
+        return replace(episode, name=f"sample {i}", stock=run.stock[i], flow=run.flow[i], bands=bands, about="")
+
+    draws = map(draw, range(min(SHOWN, count)))
     note = f"Flows and stocks are means of {count} samples of what is uncertain or disturbed."
     return ReportPage(_title(network), network, (episode, *draws), notes=(note,))
 
@@ -239,8 +228,8 @@ def _episode(
     found = indicators(network, outcome.mean_flow)
     shares = {"recycling_rate": found.recycling_rate, "recycled_content": found.recycled_content} if found else {}
     figures = {**figures, **{which: Aggregate(share, np.nan, np.nan) for which, share in shares.items()}}
-    totals = zip(network.accounts, outcome.accounts.T, strict=True)
-    figures |= {f"account:{account.id}": over_episodes(total) for account, total in totals}
+    accounts = episode_quantities(network, "account")
+    figures |= {f"account:{account.of}": over_episodes(account.totals(outcome)) for account in accounts}
     return PageEpisode(
         name=name,
         network=network,
@@ -249,19 +238,23 @@ def _episode(
         stock=outcome.stock,
         flow=outcome.flow,
         controls=outcome.controls,
-        circularity=_mean(outcome.circularity_mean, np.inf),
-        levels=tuple(_mean(outcome.levels[:, s], 1.0) for s in range(len(network.services))),
+        bands=_bands(network, outcome, _mean),
         about=CONFIDENCE.format(count) if count > 1 else "",
         figures=figures,
-        disturbances=tuple(_mean(values, np.inf) for values in np.moveaxis(outcome.disturbances, 2, 0)),
-        accounts=tuple(_mean(values, np.inf) for values in np.moveaxis(outcome.bookings, 1, 0)),
         contents=outcome.contents,
     )
 
 
-def _mean(values: Floats, top: float) -> Band:
-    """Return the mean over episodes, shape (episodes, steps), with its interval, which ends at ``top``."""
-    mean, *ends = mean_interval(values, (-np.inf, top))
+def _bands(
+    network: Network, run: Rollout, band: Callable[[EpisodeQuantity, Floats], Band]
+) -> dict[QuantityKind, tuple[Band, ...]]:
+    quantities = {kind: episode_quantities(network, kind) for kind in BANDS}
+    return {kind: tuple(band(part, part.values(run)) for part in parts) for kind, parts in quantities.items()}
+
+
+def _mean(quantity: EpisodeQuantity, values: Floats) -> Band:
+    """Return the mean over episodes, shape (episodes, steps), with its interval, of a level up to 1 at most."""
+    mean, *ends = mean_interval(values, (-np.inf, 1.0 if quantity.kind == "service" else np.inf))
     return Band(mean, *ends) if len(values) > 1 else Band(mean)
 
 

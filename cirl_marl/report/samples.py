@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -11,18 +11,20 @@ import numpy as np
 from matplotlib.axes import Axes
 from rich.table import Table
 
+from cirl_marl.controllers.episode_quantities import QuantityKind, episode_quantities
 from cirl_marl.controllers.rollout import interval_ends
 from cirl_marl.drawing.style import SERIES, axis_time, readable
 from cirl_marl.evaluation.sampling import SampledEpisodes, Sensitivity
-from cirl_marl.evaluation.simulations import disturbance_columns
 from cirl_marl.evaluation.statistics import finite_or_none
 from cirl_marl.network import Floats
+from cirl_marl.network.calendar import time_columns
 from cirl_marl.records.files import publish_result
 from cirl_marl.report.panels import LEVELS, PANELS, Panel, save_panels
 from cirl_marl.report.terminal import text_table
-from cirl_marl.report.trajectory import time_columns
 
 QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
+KINDS: tuple[QuantityKind, ...] = ("circularity", "service", "account", "stock", "flow", "disturbance")
+"""Kinds of quantities that have bands."""
 SHOWN = 3
 """Single samples in a picture."""
 ROWS = 8
@@ -59,9 +61,10 @@ def write_samples(
     header, clock = time_columns(samples.network, interval_ends(samples.network))
     header += ["quantity", "unit", "mean", *(f"quantile {level:g}" for level in QUANTILES)]
     rows = []
-    for quantity, unit, values in _quantities(samples):
+    for quantity in episode_quantities(samples.network, *KINDS):
+        values = quantity.values(samples.rollout)
         bands = np.array([values.mean(axis=0), *np.quantile(values, QUANTILES, axis=0)]).T.tolist()
-        rows += [[*time, quantity, unit, *band] for time, band in zip(clock, bands, strict=True)]
+        rows += [[*time, quantity.name, quantity.unit, *band] for time, band in zip(clock, bands, strict=True)]
     tables = {f"{name}_bands.csv": (header, rows), f"{name}_draws.csv": _draws(samples)}
     if causes:
         tables[f"{name}_causes.csv"] = _causes(samples, causes)
@@ -74,10 +77,10 @@ def _draws(samples: SampledEpisodes) -> tuple[list[str], list[list[object]]]:
     header = ["sample", *(f"factor on {name}" for name in samples.names), f"mean circularity ({network.mass_unit})"]
     header += [f"mean level of {service.id}" for service in network.services]
     header += [f"{account.id} ({account.unit})" for account in network.accounts]
-    header += [f"mean of {name}" for name in disturbance_columns(network)]
-    columns = [samples.factors, samples.circularity.mean(axis=1)[:, None], samples.levels.mean(axis=2)]
-    columns += [samples.accounts, samples.disturbances.mean(axis=1)]
-    return header, [[i, *row] for i, row in enumerate(np.concatenate(columns, axis=1).tolist())]
+    header += [f"mean of {disturbance.heading}" for disturbance in episode_quantities(network, "disturbance")]
+    figures = [values for _, _, values in samples.figures()]
+    columns = [samples.factors, *figures, samples.rollout.disturbances.mean(axis=1)]
+    return header, [[i, *row] for i, row in enumerate(np.column_stack(columns).tolist())]
 
 
 def _causes(samples: SampledEpisodes, causes: Sequence[Sensitivity]) -> tuple[list[str], list[list[object]]]:
@@ -86,32 +89,19 @@ def _causes(samples: SampledEpisodes, causes: Sequence[Sensitivity]) -> tuple[li
     return header, [[samples.names[i], *map(finite_or_none, figures[i])] for i in _order(causes)]
 
 
-def _quantities(samples: SampledEpisodes) -> Iterator[tuple[str, str, Floats]]:
-    """Yield name, unit and values, shape (samples, steps), of everything that has a band."""
-    network = samples.network
-    mass, flow = network.mass_unit, f"{network.mass_unit}/{network.time_unit}"
-    yield "mean circularity", mass, samples.circularity
-    yield from ((f"level of {service.id}", "1", samples.levels[:, s]) for s, service in enumerate(network.services))
-    yield from ((account.id, account.unit, samples.bookings[:, a]) for a, account in enumerate(network.accounts))
-    yield from ((f"stock of {node.id}", mass, samples.stock[:, :, i]) for i, node in enumerate(network.stores))
-    yield from ((f"flow of {arc.id}", flow, samples.flow[:, :, k]) for k, arc in enumerate(network.arcs))
-    parts = zip(network.processes.names, network.processes.disturbances, strict=True)
-    yield from (
-        (f"disturbance {name}", part.unit, samples.disturbances[:, :, n]) for n, (name, part) in enumerate(parts)
-    )
-
-
 def save_bands(path: str | Path, samples: SampledEpisodes, *, title: str) -> Path:
     """Save bands of λ, of services and of what spreads most, as a PNG and return its path."""
-    network, quantities = samples.network, list(_quantities(samples))
-    services, ends = len(network.services), interval_ends(samples.network)
-    rest = sorted(quantities[1 + services :], key=lambda quantity: -_width(quantity[2]))
-    uncertain = [quantity for quantity in rest if _width(quantity[2]) > 0]
+    network, ends = samples.network, interval_ends(samples.network)
+    series = [(quantity, quantity.values(samples.rollout)) for quantity in episode_quantities(network, *KINDS)]
+    services = len(network.services)
+    rest = sorted(series[1 + services :], key=lambda pair: -_width(pair[1]))
+    uncertain = [pair for pair in rest if _width(pair[1]) > 0]
     panels = []
-    for name, unit, values in [*quantities[: 1 + min(3, services)], *uncertain][:PANELS]:
-        time = axis_time(ends if name.startswith("stock") else ends - network.episode.control_interval / 2, network)
+    for quantity, values in [*series[: 1 + min(3, services)], *uncertain][:PANELS]:
+        time = axis_time(ends if quantity.kind == "stock" else ends - network.episode.control_interval / 2, network)
         draw = partial(_draw_bands, time=time, bands=np.quantile(values, QUANTILES, axis=0), draws=values[:SHOWN])
-        panels.append(Panel(readable(name), unit, draw, LEVELS if name.startswith("level") else None))
+        limits = LEVELS if quantity.kind == "service" else None
+        panels.append(Panel(readable(quantity.name), quantity.unit, draw, limits))
     return save_panels(path, network, panels, title=title, legend=4)
 
 

@@ -13,8 +13,8 @@ from cirl_marl.controllers.pyramids import Pyramid, pyramids
 from cirl_marl.controllers.rollout import interval_ends
 from cirl_marl.drawing.style import SERIES, WIDTH, readable, save, style_axes
 from cirl_marl.evaluation.simulations import Simulation
-from cirl_marl.network import Floats, Network
-from cirl_marl.network.calendar import labels
+from cirl_marl.network import Network
+from cirl_marl.network.calendar import labels, time_columns
 from cirl_marl.records.files import write_table
 from cirl_marl.report.account_tables import write_accounts
 from cirl_marl.report.curves import save_trajectory
@@ -31,40 +31,13 @@ def write_trajectory(folder: Path, name: str, simulation: Simulation, title: str
     ``name_accounts.csv`` and ``name_accounts.png`` what each compartment books.
     """
     network = simulation.env.network
-    files = [simulation.write(folder / f"{name}.csv"), draw_trajectory(folder / f"{name}.png", simulation, title=title)]
+    files = [simulation.write(folder / f"{name}.csv"), save_trajectory(folder / f"{name}.png", simulation, title=title)]
     if network.accounts:
         files += write_accounts(folder, name, simulation, title)
-    if of_ages := pyramids(network, simulation.rollout, simulation.rollout.start):
+    if of_ages := pyramids(network, simulation.rollout):
         files.append(write_table(folder / f"{name}_ages.csv", *ages_table(network, of_ages)))
         files.append(save_pyramids(folder / f"{name}_ages.png", network, of_ages, title=title))
     return files
-
-
-def draw_trajectory(path: Path, simulation: Simulation, *, title: str = "") -> Path:
-    """Save λ, service level, stocks and flows of a simulated episode over time as a PNG; return its path."""
-    episode, network = simulation.rollout, simulation.network
-    return save_trajectory(
-        path,
-        network,
-        interval_ends(network),
-        episode.stock.T,
-        episode.flow.T,
-        episode.circularity_mean[0],
-        start=np.concatenate([episode.start, episode.start_load]),
-        load=episode.load.T,
-        service=episode.service[0] if network.services else None,
-        title=title or f"{network.title or network.name}, {simulation.control}",
-    )
-
-
-def time_columns(network: Network, times: Floats) -> tuple[list[str], list[list[object]]]:
-    """Return header and cells of the first columns of tables over time: the time, and the year or date if there is one.
-
-    ``times`` are ends of intervals; there is a row of cells for each.
-    """
-    calendar, dates = labels(network, times)
-    header = [f"time ({network.time_unit})", *(f"{name} at the end" for name in calendar)]
-    return header, [list(row) for row in zip(times.tolist(), *dates, strict=True)]
 
 
 def ages_table(network: Network, of_ages: Sequence[Pyramid]) -> tuple[list[str], list[list[object]]]:
