@@ -13,7 +13,7 @@ from cirl_marl.controllers.basic import Neutral
 from cirl_marl.controllers.rollout import Rollout, episode_start
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, first_lines, unknown_name
+from cirl_marl.errors import CirlError, check_names, first_lines, unknown_name
 from cirl_marl.importing.balances import Change, Processes, ProcessKind, Reconciliation, Residual
 from cirl_marl.importing.definition import DefinitionWriter, ImportedFiles, identifiers
 from cirl_marl.importing.flow_table import FlowTable, StockKey, read_flows, read_stocks
@@ -41,14 +41,18 @@ Ask = Callable[[str, ProcessKind], Role]
 class ImportReport:
     """What an import found and wrote."""
 
-    table: Annotated[FlowTable, "the flows, as they were reconciled"]
-    processes: Annotated[Processes, "what each process is"]
+    processes: Annotated[Processes, "what each process is, of the flows as they were reconciled"]
     roles: Annotated[Mapping[str, Role], "of sources, sinks and stores"]
     reconciliation: Annotated[Reconciliation | None, "how flows were adjusted; None if they balanced"]
     stock_mistakes: Annotated[Mapping[str, float], "by store how far its stocks and flows are apart at most, mass"]
     largest_error: Annotated[float, "largest difference between a simulated flow and the table, mass/time"]
     content_error: Annotated[float, "largest difference between a simulated content and the tables, as stores mix"]
     files: Annotated[tuple[Path, ...], "what was written, the definition first"]
+
+    @property
+    def table(self) -> FlowTable:
+        """The flows, as they were reconciled."""
+        return self.processes.table
 
     @property
     def changes(self) -> tuple[Change, ...]:
@@ -109,15 +113,12 @@ def import_flows(
         table = table.of(regions)
     known_stocks, contents = ({}, {}) if stocks is None else read_stocks(stocks, table.unit.rpartition("/")[0])
     substances = () if table.substances is None else table.substances.names
-    for substance in contents:
-        if substance not in substances:
-            raise CirlError(f"stocks: {unknown_name('substance', substance, substances)}")
+    check_names("substance", contents, substances, "stocks: ")
     holders = _matching_processes(table, [*stores, *_stock_processes(table, known_stocks)], "store")
-    table = Processes(table, holders).mix_substances()
-    processes = Processes(table, holders)
+    processes = Processes(table, holders).mix_substances()
     _check_stores(processes, stores)
-    _check_first_stocks(table, processes, known_stocks)
-    _check_stock_contents(stocks, table, processes, contents)
+    _check_first_stocks(processes, known_stocks)
+    _check_stock_contents(stocks, processes, contents)
     reconciliation: Reconciliation | None = None
     residuals = processes.residuals
     if not reconcile:
@@ -125,16 +126,13 @@ def import_flows(
         if residuals:
             raise CirlError(_imbalance_message(table, residuals))
     elif residuals:
-        table, reconciliation = processes.reconcile()
-        processes = Processes(table, processes.of(ProcessKind.STORE))
-        processes = Processes(processes.mix_substances(), processes.of(ProcessKind.STORE))
+        processes, reconciliation = processes.reconcile()
+        processes = processes.mix_substances()
     if reconcile and table.substances is not None:
-        table, of_substances = processes.reconcile_substances()
+        processes, of_substances = processes.reconcile_substances()
         reconciliation = of_substances if reconciliation is None else reconciliation + of_substances
-        processes = Processes(table, processes.of(ProcessKind.STORE))
-    role_of = _roles(table, processes, roles, ask)
+    role_of = _roles(processes, roles, ask)
     writer = DefinitionWriter(
-        table=table,
         processes=processes,
         roles=role_of,
         stocks=known_stocks,
@@ -148,20 +146,12 @@ def import_flows(
     with publish_folder(out.parent, last=out.name) as partial:
         files = _write(partial, out.name, name, definition, changes)
         try:
-            error, content_error = _largest_errors(partial / out.name, table, processes, contents, definition, progress)
+            error, content_error = _largest_errors(partial / out.name, processes, contents, definition, progress)
         except CirlError as failure:
             raise CirlError(str(failure).replace(str(partial), str(out.parent))) from failure
     mistakes = processes.stock_mistakes(known_stocks)
-    return ImportReport(
-        table,
-        processes,
-        role_of,
-        reconciliation,
-        mistakes,
-        error,
-        content_error,
-        tuple(out.parent / file for file in files),
-    )
+    paths = tuple(out.parent / file for file in files)
+    return ImportReport(processes, role_of, reconciliation, mistakes, error, content_error, paths)
 
 
 def _check_stores(processes: Processes, names: Sequence[str]) -> None:
@@ -189,7 +179,7 @@ def _matching_processes(table: FlowTable, patterns: Sequence[str], label: str) -
     return list(dict.fromkeys(processes))
 
 
-def _check_stock_contents(path: Path | None, table: FlowTable, processes: Processes, contents: StockContents) -> None:
+def _check_stock_contents(path: Path | None, processes: Processes, contents: StockContents) -> None:
     """Refuse contents of stocks that flows alone decide, and of years that are not those of the flows.
 
     Raises:
@@ -199,7 +189,7 @@ def _check_stock_contents(path: Path | None, table: FlowTable, processes: Proces
         ProcessKind.SOURCE: "is a source, and has what leaves it; give the content of its flows",
         ProcessKind.SINK: "is a sink, and is empty at the start; leave it out",
     }
-    before, last = table.years[0] - 1, table.years[-1]
+    before, last = processes.table.years[0] - 1, processes.table.years[-1]
     for substance, parts in contents.items():
         for (_, process, year), part in parts.items():
             subject = f"{path}: {part:.4g} of '{process}' in {year} is {substance}, but"
@@ -210,13 +200,13 @@ def _check_stock_contents(path: Path | None, table: FlowTable, processes: Proces
                 raise CirlError(f"{subject} contents of stocks are of {years}; leave it out")
 
 
-def _check_first_stocks(table: FlowTable, processes: Processes, stocks: Mapping[StockKey, float]) -> None:
+def _check_first_stocks(processes: Processes, stocks: Mapping[StockKey, float]) -> None:
     """Refuse stocks of processes of which none is that at the start, as they would start with another.
 
     Raises:
         CirlError: naming the first of them.
     """
-    before, kinds = table.years[0] - 1, (ProcessKind.STORE, ProcessKind.SOURCE)
+    before, kinds = processes.table.years[0] - 1, (ProcessKind.STORE, ProcessKind.SOURCE)
     at_start = {process for _, process, year in stocks if year == before}
     for _, process, year in stocks:
         if process not in at_start and processes.kinds[process] in kinds:
@@ -225,18 +215,13 @@ def _check_first_stocks(table: FlowTable, processes: Processes, stocks: Mapping[
 
 
 def _stock_processes(table: FlowTable, stocks: Mapping[tuple[str, str, int], float]) -> list[str]:
-    regions = {region for region, _, _ in stocks}
-    for region in regions:
-        if region not in table.regions:
-            raise CirlError(f"stocks: {unknown_name('region', region, table.regions)}")
+    check_names("region", (region for region, _, _ in stocks), table.regions, "stocks: ")
     return list(dict.fromkeys(process for _, process, _ in stocks))
 
 
-def _roles(
-    table: FlowTable, processes: Processes, roles: Mapping[str, Sequence[str]], ask: Ask | None
-) -> dict[str, Role]:
+def _roles(processes: Processes, roles: Mapping[str, Sequence[str]], ask: Ask | None) -> dict[str, Role]:
     """Return the roles of processes; sources and sinks all have one."""
-    role_of: dict[str, Role] = {}
+    table, role_of = processes.table, dict[str, Role]()
     for role, patterns in roles.items():
         for name in _matching_processes(table, patterns, role):
             if role_of.setdefault(name, Role(role)) is not Role(role):
@@ -287,7 +272,6 @@ def _write(folder: Path, file: str, name: str, definition: ImportedFiles, change
 
 def _largest_errors(
     path: Path,
-    table: FlowTable,
     processes: Processes,
     stock_contents: StockContents,
     definition: ImportedFiles,
@@ -298,7 +282,7 @@ def _largest_errors(
     Raises:
         CirlError: for a flow that the network does not give back, or without stores a content.
     """
-    worst, worst_content = 0.0, 0.0
+    table, worst, worst_content = processes.table, 0.0, 0.0
     ids = identifiers(table.regions) if table.regions != ("",) else {"": ""}
     flows = table.grid(table.values)
     for done, (region, id_) in enumerate(ids.items()):
@@ -314,7 +298,7 @@ def _largest_errors(
             value = run.flow[y, order[int(k)]]
             label = f"{table.years[int(y)]}{f' in {region}' if region else ''}"
             contents = run.contents[y][:, len(network.nodes) + np.array(order)]
-            cause = _mixed_store(table, processes, contents, (done, int(y)))
+            cause = _mixed_store(processes, contents, (done, int(y)))
             raise CirlError(
                 f"{table.name}: the network does not give back {pair} in {label}: {value:g}, not {table_flows[y, k]:g} "
                 f"{table.unit}; {cause or 'a store may run empty: give stocks'}"
@@ -326,7 +310,7 @@ def _largest_errors(
             errors = np.abs(amounts - table.substances.amounts[:, done])
             flows_of_year = np.maximum(table_flows, NOTICEABLE * table_flows.max())
             s, y, k = np.unravel_index(int((errors / flows_of_year).argmax()), errors.shape)
-            of_stocks = _content_errors(network, run, table, processes, stock_contents, region)
+            of_stocks = _content_errors(network, run, processes, stock_contents, region)
             worst_content = max(worst_content, float((errors / flows_of_year)[s, y, k]), *of_stocks)
             sizes = table.substances.amounts[:, done].max(axis=(1, 2), keepdims=True)
             if (errors > WRONG * sizes).any() and not processes.of(ProcessKind.STORE):
@@ -336,16 +320,15 @@ def _largest_errors(
     return worst, worst_content
 
 
-def _mixed_store(table: FlowTable, processes: Processes, contents: Floats, place: tuple[int, int]) -> str:
+def _mixed_store(processes: Processes, contents: Floats, place: tuple[int, int]) -> str:
     """Say which store does not give what the table has, as it mixes all that it holds; empty if none is far off.
 
     Args:
-        table: of all regions and years.
-        processes: of the table.
+        processes: of all regions and years.
         contents: parts of substances in its flows, as simulated, shape (substances, pairs).
         place: region and year.
     """
-    if table.substances is None:
+    if (table := processes.table).substances is None:
         return ""
     stores, flow = processes.of(ProcessKind.STORE), table.grid(table.values)[place]
     leaves = np.array([pair.source in stores for pair in table.pairs]) & (flow > 0)
@@ -359,11 +342,11 @@ def _mixed_store(table: FlowTable, processes: Processes, contents: Floats, place
 
 
 def _content_errors(
-    network: Network, run: Rollout, table: FlowTable, processes: Processes, contents: StockContents, region: str
+    network: Network, run: Rollout, processes: Processes, contents: StockContents, region: str
 ) -> Iterator[float]:
     """Yield how far stocks of a region are, at the ends of years, from the contents that a table has."""
+    table, nodes = processes.table, identifiers(processes.names)
     assert table.substances is not None
-    nodes = identifiers(processes.names)
     for s, substance in enumerate(table.substances.names):
         for (region_of_stock, process, year), part in contents.get(substance, {}).items():
             if region_of_stock == region and year in table.years:

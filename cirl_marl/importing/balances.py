@@ -107,9 +107,10 @@ class Processes:
     """The processes of a table.
 
     Attributes:
+        table: the flows.
         names: in the order in which the table names them.
         kinds: what each is.
-        assumed: stores that nobody named as such, found by what stays in them.
+        inferred_stores: stores that nobody named as such, found by what stays in them.
     """
 
     def __init__(self, table: FlowTable, stores: Collection[str] = ()) -> None:
@@ -117,7 +118,7 @@ class Processes:
 
         ``stores`` hold a stock; if none is named, those do in which much of what enters stays.
         """
-        self._table = table
+        self.table, self._stores = table, stores
         self.names = tuple(dict.fromkeys(end for pair in table.pairs for end in (pair.source, pair.target)))
         self._place = {name: i for i, name in enumerate(self.names)}
         self.flows = table.grid(table.values)
@@ -156,7 +157,7 @@ class Processes:
     @property
     def residuals(self) -> list[Residual]:
         """What does not balance beyond rounding, of the whole and of substances, the largest first."""
-        substances = self._table.substances
+        substances = self.table.substances
         tables = {} if substances is None else dict(zip(substances.names, substances.amounts, strict=True))
         residuals = [
             residual for name, flows in {"": self.flows, **tables}.items() for residual in self._off(name, flows)
@@ -166,18 +167,18 @@ class Processes:
     def _off(self, substance: str, flows: Floats) -> Iterator[Residual]:
         inflow, outflow = self._sums(1.0, flows), self._sums(-1.0, flows)
         wrong = (np.abs(inflow - outflow) > _rounding(flows)) & self._transit
-        regions, years = self._table.regions, self._table.years
+        regions, years = self.table.regions, self.table.years
         for r, y, i in np.argwhere(wrong).tolist():
             yield Residual(self.names[i], regions[r], years[y], inflow[r, y, i], outflow[r, y, i], substance)
 
-    def mix_substances(self) -> FlowTable:
-        """Return the table with what processes without stock hand on of a substance of which no outflow says anything.
+    def mix_substances(self) -> Processes:
+        """Return the processes, with what those without stock hand on of a substance of which no outflow says anything.
 
         They mix what enters. These amounts are as uncertain as they are large.
         """
-        table, substances = self._table, self._table.substances
+        table, substances = self.table, self.table.substances
         if substances is None:
-            return table
+            return self
         amounts, deviations = substances.amounts.copy(), substances.deviations.copy()
         for place in np.ndindex(amounts.shape[:3]):
             silent = self._silent(place)
@@ -185,18 +186,18 @@ class Processes:
             amounts[place][leaves] = 0.0
             amounts[place] = mixed_amounts(amounts[place], self.flows[place[1:]], self._incidence, silent)
             deviations[place][leaves] = amounts[place][leaves]
-        return replace(table, substances=replace(substances, amounts=amounts, deviations=deviations))
+        mixed = replace(table, substances=replace(substances, amounts=amounts, deviations=deviations))
+        return Processes(mixed, self._stores)
 
     def _silent(self, place: tuple[int, ...]) -> Integers:
         """Return the processes without stock of whose outflows nothing is told; of a substance, region and year."""
-        assert self._table.substances is not None
-        is_told = np.isfinite(self._table.substances.is_content[place])
-        silent: Integers = np.flatnonzero(self._transit & ~((np.maximum(-self._incidence, 0.0) @ is_told) > 0))
-        return silent
+        assert self.table.substances is not None
+        is_told = np.isfinite(self.table.substances.is_content[place])
+        return np.flatnonzero(self._transit & ~((np.maximum(-self._incidence, 0.0) @ is_told) > 0))
 
     def check_contents(self) -> None:
         """Refuse flows in which there is more of substances than they are; a ``CirlError`` names the first."""
-        table = self._table
+        table = self.table
         if table.substances is None:
             return
         for r, y, k in excesses(table.substances.amounts, self.flows):
@@ -206,14 +207,14 @@ class Processes:
             flow = f"{table.pairs[k]} ({place}): {listing} in {self.flows[r, y, k]:g} {table.unit}"
             raise CirlError(f"{table.name}: {flow}: no more than all of it; correct the table, or give --reconcile")
 
-    def reconcile(self) -> tuple[FlowTable, Reconciliation]:
+    def reconcile(self) -> tuple[Processes, Reconciliation]:
         """Return flows that balance and are closest to those of the table, what was changed, and how plausible that is.
 
         In each region and year they minimise Σ ((x − m)/σ)² for x ≥ 0 and inflow = outflow of every process that
         stores nothing, m the flows of the table and σ their standard deviations, or 10 % of flows that state none
         (Cencic and Rechberger 2008). A flow of 0 stays 0.
         """
-        table, flows = self._table, self.flows.copy()
+        table, flows = self.table, self.flows.copy()
         stated_deviations = table.grid(table.deviations, np.nan)
         balances, changes, chi_square, degrees = self._balances, [], 0.0, 0
         for r, region in enumerate(table.regions):
@@ -234,18 +235,19 @@ class Processes:
         substances = table.substances
         if substances is not None:
             substances = substances.of_flows(self.flows, flows)
-        return replace(table, values=flows[table.cells], substances=substances), Reconciliation(
+        balanced_table = replace(table, values=flows[table.cells], substances=substances)
+        return Processes(balanced_table, self.of(ProcessKind.STORE)), Reconciliation(
             tuple(changes), chi_square, degrees
         )
 
-    def reconcile_substances(self) -> tuple[FlowTable, Reconciliation]:
+    def reconcile_substances(self) -> tuple[Processes, Reconciliation]:
         """Return substances that balance, are closest to those of the table and within the flows, and what was changed.
 
         The flows stay: each substance balances at every process without stock, and all are together at most the flow
         (``closest_amounts``). Deviations are as those of flows, 10 % of amounts
         that state none.
         """
-        table, substances = self._table, self._table.substances
+        table, substances = self.table, self.table.substances
         assert substances is not None
         sizes = substances.amounts.max(axis=3)
         stated, before = substances.deviations, substances.amounts
@@ -265,8 +267,10 @@ class Processes:
                 for e, k in np.argwhere(np.abs(closest - measured) > 1e-9 * sizes[:, r, y, None]).tolist():
                     cells = float(measured[e, k]), float(closest[e, k]), float(spread[e, k])
                     changes.append(Change(region, year, table.pairs[k], *cells, substances.names[e]))
-        result = replace(table, substances=replace(substances, amounts=amounts))
-        return result, Reconciliation(tuple(changes), chi_square, degrees)
+        balanced_table = replace(table, substances=replace(substances, amounts=amounts))
+        return Processes(balanced_table, self.of(ProcessKind.STORE)), Reconciliation(
+            tuple(changes), chi_square, degrees
+        )
 
     def stock_mistakes(self, stocks: Mapping[tuple[str, str, int], float]) -> dict[str, float]:
         """Return, for each process with stocks, the largest difference between their growth and what the flows say.
@@ -274,7 +278,7 @@ class Processes:
         The stock of a year is that at its end; stocks are by region, process and year.
         """
         worst: dict[str, float] = {}
-        table, net = self._table, self.flows @ self._incidence.T
+        table, net = self.table, self.flows @ self._incidence.T
         for (region, name, year), stock in stocks.items():
             before = stocks.get((region, name, year - 1))
             if before is not None and year in table.years:

@@ -13,7 +13,7 @@ import numpy as np
 
 from cirl_marl.errors import CirlError
 from cirl_marl.importing.balances import Processes, ProcessKind
-from cirl_marl.importing.flow_table import Connection, FlowTable
+from cirl_marl.importing.flow_table import Connection
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record, with_field_docs
 from cirl_marl.network.elements import Role
@@ -87,8 +87,7 @@ class DefinitionWriter:
     Where nothing passed, the shares are those of the nearest year with any, or of all regions together.
     """
 
-    table: Annotated[FlowTable, "flows that balance"]
-    processes: Annotated[Processes, "its processes"]
+    processes: Annotated[Processes, "of a table of flows that balance"]
     roles: Annotated[Mapping[str, Role], "of sources, sinks and stores; others belong to the technosphere"]
     stocks: Annotated[Mapping[tuple[str, str, int], float], "by region, process and year, at its end"]
     stock_contents: Annotated[
@@ -100,7 +99,8 @@ class DefinitionWriter:
 
     def __post_init__(self) -> None:
         """Name nodes, arcs and regions."""
-        table, processes = self.table, self.processes
+        processes = self.processes
+        self.table = table = processes.table
         self._mass = table.unit.rpartition("/")[0]
         self._regional = table.regions != ("",)
         self._nodes = identifiers(processes.names)
