@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -129,3 +130,14 @@ def test_hidden_modules_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         (tmp_path / package / "__init__.py").write_text(text)
         (tmp_path / package / "part.py").write_text("")
         assert hidden(package, tmp_path / package / "__init__.py") == (set() if package == "hiding_none" else {"part"})
+
+
+def test_docstrings_name_attributes_that_there_are() -> None:
+    """What a class says of its attributes is of those that its module gives it, and not of what they once were."""
+    for path in (CHECKOUT / PACKAGE).rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        for class_ in (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.ClassDef)):
+            _, _, section = (ast.get_docstring(class_) or "").partition("Attributes:\n")
+            for name in re.findall(r"^    (\w+):", section.split("\n\n")[0], re.M):
+                found = re.search(rf"self\.{name}\b|^    (?:def )?{name}\b", text, re.M)
+                assert found, f"{path.name}: {class_.name} has no attribute '{name}'"

@@ -39,7 +39,7 @@ class DifferentiableEnv:
         env: the environment.
         start: masses at the start of the episode, shape (masses, B), a leaf whose ``grad`` is filled.
         disturbances: their values, shape (intervals, names, B), likewise.
-        booked: discounted amounts that the last interval booked on accounts, shape (accounts, B).
+        bookings: discounted amounts that the last interval booked on accounts, shape (accounts, B).
     """
 
     bookings: Tensor

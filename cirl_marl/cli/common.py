@@ -134,12 +134,13 @@ def budgets(entries: Sequence[str] | None) -> dict[str, float]:
 
 
 @contextmanager
-def stoppable(place: str) -> Iterator[None]:
+def stoppable(place: str, printer: Console = console) -> Iterator[None]:
     """Say after Ctrl-C what is kept, and end with code 130; ``place`` says what of it is where."""
     try:
         yield
     except KeyboardInterrupt:
-        say(f"\nstopped; {place}. The same command goes on.")
+        message = f"\nstopped; {place}. The same command goes on."
+        printer.print(message, soft_wrap=True, highlight=False, markup=False)
         raise typer.Exit(130) from None
 
 

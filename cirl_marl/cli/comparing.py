@@ -74,7 +74,7 @@ def compare(
     options: dict[str, Any] = {"seed": seed, "min_service": min_service, "uncertain": uncertain}
     options["at_most"] = budgets = common.budgets(at_most)
     options |= {"tune": tune, "futures": futures, "bounds": bounds and bound_draws is None}
-    expected = None
+    bound_of_draws = None
     if bound_draws is None and (on, workers) != ("here", None):
         raise CirlError(f"--on {on}, --workers {workers}: only draws of --bound-draws are proved elsewhere")
     if bound_draws is None:
@@ -86,15 +86,15 @@ def compare(
     else:
         definition = load_network(network, scenario=scenario)
         # what cannot be compared is refused before the bound is computed, on which price_policy waits
-        directories, known = [RunDirectory(run) for run in runs or ()], [n for n in names if n != "price_policy"]
-        contenders(directories, known, definition, min_service, uncertain, futures=futures, at_most=budgets)
+        directories, free_names = [RunDirectory(run) for run in runs or ()], [n for n in names if n != "price_policy"]
+        contenders(directories, free_names, definition, min_service, uncertain, futures=futures, at_most=budgets)
         sampling = Sampling(draws=bound_draws, seed=seed, numbers=bool(uncertain), on=on, workers=workers)
-        asked: dict[str, Any] = {"min_service": min_service, "at_most": budgets, "uncertain": sampling}
+        bound_options: dict[str, Any] = {"min_service": min_service, "at_most": budgets, "uncertain": sampling}
         with common.shares() as progress:
-            expected = bound(definition, degree=1, progress=partial(progress, "bound"), **asked)
+            bound_of_draws = bound(definition, degree=1, progress=partial(progress, "bound"), **bound_options)
     with common.shares() as progress:
         place: dict[str, Any] = {"network": network, "scenario": scenario, "progress": progress}
-        comparison = compared(runs or [], names, uncertain_bound=expected, **place, **options)
+        comparison = compared(runs or [], names, uncertain_bound=bound_of_draws, **place, **options)
     common.console.print(comparison_table(comparison))
     if comparison.network.disturbed:
         common.console.print(worst_table(comparison))

@@ -24,6 +24,7 @@ from cirl_marl.cli.common import (
     end_with,
     errors,
     folder_for,
+    stoppable,
     values_by_name,
 )
 from cirl_marl.jobs import PLACES
@@ -65,15 +66,10 @@ def sweep(
     printer = errors if as_json else console
     settings = values_by_name(slurm, "--slurm", "NAME=VALUE, such as partition=long", str)
     options: dict[str, Any] = {"on": on, "workers": workers, "out": out, "settings": settings}
-    try:
-        with _live(as_json) as watch:
-            say = partial(printer.print, soft_wrap=True, highlight=False, markup=False)
-            outcome = swept(file, **options, checkpoint_every=checkpoint_every, watch=watch, say=say)
-    except KeyboardInterrupt:
-        place = out or Path("runs") / f"sweep-{file.stem}"
-        message = f"\nstopped; everything learnt is kept in {place}. The same command goes on."
-        printer.print(message, soft_wrap=True, highlight=False)
-        raise typer.Exit(130) from None
+    place = out or Path("runs") / f"sweep-{file.stem}"
+    with stoppable(f"everything learnt is kept in {place}", printer), _live(as_json) as watch:
+        say = partial(printer.print, soft_wrap=True, highlight=False, markup=False)
+        outcome = swept(file, **options, checkpoint_every=checkpoint_every, watch=watch, say=say)
     if as_json:
         sys.stdout.write(json.dumps(outcome.rows, indent=2) + "\n")
     else:

@@ -67,11 +67,11 @@ class DeliveryTruck(TransportTruck, Vehicle):
         return self._at(state, self.target_m)
 
     def depart(self, state: Floats, mask: NDArray[np.bool_]) -> Floats:
-        """Return the state with the recipient as destination ``mask`` the truck was loaded."""
+        """Return the state with the recipient as destination where, by ``mask``, the truck was loaded."""
         return self._heading(state, mask, self.target_m)
 
     def turn_back(self, state: Floats, mask: NDArray[np.bool_]) -> Floats:
-        """Return the state with the donor as destination ``mask`` the truck was unloaded."""
+        """Return the state with the donor as destination where, by ``mask``, it was unloaded."""
         return self._heading(state, mask, 0.0)
 
     def _at(self, state: Floats, place_m: float) -> NDArray[np.bool_]:

@@ -157,8 +157,7 @@ class Arrivals:
         sparse_entries = nodes.astype(np.intp), entries.astype(np.intp), amounts
         columns = len(entry_nodes), worth.shape[1]
         self._crossings = Crossings(routing.detours.elimination, sparse_entries, exits, columns)
-        constant: Floats = worth[routing.places[entry_nodes]]
-        return constant
+        return worth[routing.places[entry_nodes]]
 
     def __call__(self, routes: IntervalRoutes | None) -> Floats:
         """Return what each arc adds to what each service measures, per unit and time, shape (arcs, B or 1, services).

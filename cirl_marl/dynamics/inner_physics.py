@@ -31,10 +31,10 @@ class InnerPhysics:
         names: ``compartment.state`` of each row of the stacked state.
         owners: compartments with a model, in network order.
         rows: rows of each owner's state.
-        observed: rows of each owner's state that an agent sees.
+        observed_rows: rows of each owner's state that an agent sees.
         visible: all of them, in order; the others are states of a simulator.
         measure_names: ``compartment.measure`` of each measured quantity.
-        ranged: rows whose start is drawn from a range; the others are drawn by their models.
+        range_rows: rows whose start is drawn from a range; the others are drawn by their models.
         low: lower ends of the initial ranges, shape (ranged rows,).
         high: upper ends.
     """

@@ -109,8 +109,7 @@ class Ledger:
             factors: those on numbers that are not certain, shape (numbers, B).
         """
         rates = self._factors(self._rates_in(step), factors)
-        amounts: Floats = self._amounts(flow, (before + after) / 2, deviation) * rates * self._interval
-        return amounts
+        return self._amounts(flow, (before + after) / 2, deviation) * rates * self._interval
 
     def _amounts(self, flow: Floats, stock: Floats, deviation: Floats | None) -> Floats:
         """Return what each entry is charged for, shape (entries, B)."""

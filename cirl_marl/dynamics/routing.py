@@ -49,8 +49,8 @@ class Routing:
         donors: which of the nodes each leaves.
         ends: what each enters: one of the nodes, or the number of nodes plus a store.
         places: row of each node among the throughputs before elimination: constant nodes in their order, then the kept.
-        found: row of the donor of each of ``arcs`` among the throughputs.
-        fixed: which of ``arcs`` have the same share in all copies and intervals.
+        throughput_rows: row of the donor of each of ``arcs`` among the throughputs.
+        is_fixed: which of ``arcs`` have the same share in all copies and intervals.
         detours: the constant and the kept nodes.
     """
 

@@ -34,13 +34,13 @@ class Shares:
     """The shares of all arcs of law ``share``.
 
     Attributes:
-        arcs: those arcs; first ``varying``, then ``constant``.
-        varying: arcs of splits that a control or a series changes; first those that have a control, then the others.
-        constant: arcs whose share is the same in all copies and intervals.
+        arcs: those arcs; first ``varying_arcs``, then ``constant_arcs``.
+        varying_arcs: arcs of splits that a control or a series changes; those that have a control come first.
+        constant_arcs: arcs whose share is the same in all copies and intervals.
         values: their shares, shape (constant, 1).
         highest: greatest share that each of ``arcs`` can get in any interval, shape (shares,).
-        leading: one of the arcs of each split, shape (splits,).
-        changing: whether a share may differ from interval to interval though controls are the same.
+        leading_arcs: one of the arcs of each split, shape (splits,).
+        is_time_varying: whether a share may differ from interval to interval though controls are the same.
     """
 
     def __init__(self, network: Network, ranges: Mapping[str, tuple[float, float]]) -> None:

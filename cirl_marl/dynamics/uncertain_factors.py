@@ -56,8 +56,7 @@ class IntervalFactors:
             return draws
         now = interval_of(values, step)
         if self._alone is not None:
-            alone: Floats = now.take(self._alone, axis=0)
-            return alone
+            return now.take(self._alone, axis=0)
         factors = np.ones((len(self.ranges), len(step)))
         factors[: self._draws] = draws
         for row, name in self._times:

@@ -31,7 +31,7 @@ class Evaluation:
     Attributes:
         run: the run whose policies acted.
         comparison: all episodes, and the bounds that they are held against.
-        bounded: whether bounds were asked for.
+        has_bounds: whether bounds were asked for.
         figures: means over episodes with their 95 % confidence intervals, ready for JSON.
         env: environment of the run, with as many copies as there were episodes.
     """

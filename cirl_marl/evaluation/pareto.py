@@ -76,7 +76,7 @@ def pareto_front(
     workers: int | None = None,
     progress: ProgressReport = lambda activity, share: None,
 ) -> ParetoFront:
-    """ParetoFront the weight between circularity and service.
+    """Vary the weight between circularity and service, and return what comes of each.
 
     The bound and its plans start in the middle of all initial ranges. They demand the same mean level of every service,
     from the least that the highest circularity leaves one to the most that all can have at once. Learners are trained

@@ -148,9 +148,9 @@ class Ray:
                 self._ray.init(log_to_driver=False, logging_level="error", include_dashboard=dashboard)
             except (ConnectionError, ValueError) as error:
                 raise CirlError(f"no Ray at RAY_ADDRESS={_address()}: {_last_line(error)}") from error
-        module = int(self._ray.cluster_resources().get("CPU", 1))
-        self.workers = workers or module
-        self.description = f"{self.workers} at a time on the Ray cluster, which has {module} processors"
+        processors = int(self._ray.cluster_resources().get("CPU", 1))
+        self.workers = workers or processors
+        self.description = f"{self.workers} at a time on the Ray cluster, which has {processors} processors"
         self._do = self._ray.remote(num_cpus=1, max_retries=0, max_calls=1)(_in_task)
 
     def start(self, work: Work) -> RayTask:

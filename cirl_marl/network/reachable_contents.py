@@ -151,8 +151,7 @@ def _visits(shares: Floats, givers: Integers, getters: Integers, count: int, sid
         change = abs(better - values[:, :count]).max()
         values[:, :count] = better
         if change <= SETTLED * better.max():
-            visits: Floats = better.T.clip(0.0)
-            return visits
+            return better.T.clip(0.0)
     return endless
 
 

@@ -141,15 +141,13 @@ class Series(CheckedRecord, TimeDependent):
         inside = (of >= 0) & (of < len(lowest))
         np.minimum.at(lowest, of[inside], values[inside])
         np.maximum.at(highest, of[inside], values[inside])
-        means: Floats = np.clip(np.diff(integral) / np.diff(edges), lowest, highest)
-        return means
+        return np.clip(np.diff(integral) / np.diff(edges), lowest, highest)
 
     def limits(self, times: Floats, side: Literal["left", "right"]) -> Floats:
         """Return the values until some times (``left``), or from them on (``right``), shape (times,)."""
         points, values, slopes = self._lines()
         index = np.maximum(np.searchsorted(points, times, side=side) - 1, 0)
-        limits: Floats = values[index] + slopes[index] * (times - points[index])
-        return limits
+        return values[index] + slopes[index] * (times - points[index])
 
     def _lines(self) -> tuple[Floats, Floats, Floats]:
         """Return times, values and slopes from each time on."""
@@ -169,8 +167,7 @@ class Series(CheckedRecord, TimeDependent):
         middle = (begins + ends) / 2
         part = (begins.prod(axis=0) + 4 * middle.prod(axis=0) + ends.prod(axis=0)) / 6 * np.diff(points)
         first = np.searchsorted(points, edges[:-1])
-        means: Floats = np.add.reduceat(part, first) / np.diff(edges)
-        return means
+        return np.add.reduceat(part, first) / np.diff(edges)
 
 
 Value = float | Series

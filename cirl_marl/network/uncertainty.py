@@ -246,15 +246,13 @@ def _no_content(network: Specification, node: Node, path: str) -> str:
 
 def _lost_capacity(network: Specification, part: Any, path: str) -> str:
     """Return why the upper bound of a control cannot be disturbed, or nothing."""
-    control, remedies = (
-        part.control,
-        {
-            ControlKind.TRANSFER: "shares are parts of a whole; disturb an uncontrolled transfer",
-            ControlKind.SHARE: "shares are parts of a whole; disturb an uncontrolled share, or what the donor releases",
-            ControlKind.STRETCH: "disturb the stretch of the node",
-            ControlKind.INPUT: "the input of a model is no capacity",
-        },
-    )
+    control = part.control
+    remedies = {
+        ControlKind.TRANSFER: "shares are parts of a whole; disturb an uncontrolled transfer",
+        ControlKind.SHARE: "shares are parts of a whole; disturb an uncontrolled share, or what the donor releases",
+        ControlKind.STRETCH: "disturb the stretch of the node",
+        ControlKind.INPUT: "the input of a model is no capacity",
+    }
     if path in network.uncertain:
         return "the bound of a control can be disturbed in time, but not drawn"
     if control.kind in remedies:
@@ -468,8 +466,7 @@ def _uncertain_field(network: Specification, path: str) -> tuple[Any, str]:
 def _number(part: Any, name: str) -> Value:
     """Return the number that is uncertain or disturbed; of a control what its deviation is of, or its upper bound."""
     value = part.control.high if name == CAPACITY else number_of(part, name)
-    number: Value = value.nominal if isinstance(value, Control) else value
-    return number
+    return value.nominal if isinstance(value, Control) else value
 
 
 def _split(path: str) -> tuple[str, str, str]:

@@ -27,7 +27,7 @@ class Engine(ABC):
 
     Attributes:
         env: the library's environment, unwrapped.
-        shown: names of the rows that the library shows.
+        visible_rows: names of the rows that the library shows.
         names: names of all rows.
         interval: time of a step, s.
     """
