@@ -177,10 +177,12 @@ def test_the_page_of_a_comparison(tmp_path: Path) -> None:
     (band,) = random.bands["circularity"]
     assert band.low is not None and (band.low < band.value).any()
     np.testing.assert_allclose(band.value, entry.rollout.circularity_mean.mean(axis=0))
-    np.testing.assert_array_equal(random.flow, entry.rollout.flow)
-    assert usual.start is not None
+    np.testing.assert_array_equal(random.rollout.flow, entry.rollout.flow)
+    assert np.isfinite(usual.rollout.start).all()
     moved = entry.rollout.flow[0] @ np.array([[-1.0, 1.0, 0.0], [0.0, -1.0, 1.0]])
-    np.testing.assert_allclose(usual.start + moved, entry.rollout.stock[0], rtol=1e-9, err_msg="the first start")
+    np.testing.assert_allclose(
+        usual.rollout.start + moved, entry.rollout.stock[0], rtol=1e-9, err_msg="the first start"
+    )
     assert random.figures["gap"] == found.rows[0].figure("gap") and len(story.front)
     env = next(each.env for each in simulate_alternatives(found.network))
     best = add_plan(page_of_comparison(found, without=["random"]), found, env)

@@ -81,12 +81,13 @@ def _clock(episodes: Sequence[PageEpisode]) -> Values:
     interval = network.episode.control_interval
     for episode in episodes[1:]:
         length = episode.network.episode.control_interval
-        if (len(episode.flow), length) != (len(first.flow), interval):
-            raise CirlError(
-                f"'{first.name}' has {len(first.flow)} intervals of {interval:g} {network.time_unit}, '{episode.name}'"
-                f" {len(episode.flow)} of {length:g}: a page shows them by one clock; give a number of steps for both,"
-                " or write two pages"
+        if (len(episode.rollout.flow), length) != (len(first.rollout.flow), interval):
+            clocks = (
+                f"'{first.name}' has {len(first.rollout.flow)} intervals of {interval:g} {network.time_unit}, "
+                f"'{episode.name}' {len(episode.rollout.flow)} of {length:g}"
             )
+            remedy = "give a number of steps for both, or write two pages"
+            raise CirlError(f"{clocks}: a page shows them by one clock; {remedy}")
     ends = interval_ends(network)
     calendar, dates = labels(network, ends - interval)
     names = dates[0] if dates else [f"{network.time_unit} {time:.6g}" for time in ends.tolist()]
@@ -94,7 +95,7 @@ def _clock(episodes: Sequence[PageEpisode]) -> Values:
 
 
 def _network(network: Network, episodes: Sequence[PageEpisode]) -> Values:
-    peaks = np.max([np.abs(np.nan_to_num(episode.flow)).max(axis=0) for episode in episodes], axis=0)
+    peaks = np.max([np.abs(np.nan_to_num(episode.rollout.flow)).max(axis=0) for episode in episodes], axis=0)
     sources, changing = stated_numbers(network), network.time_dependent
     nodes = [
         {
@@ -146,9 +147,9 @@ def _network(network: Network, episodes: Sequence[PageEpisode]) -> Values:
 def _substance(network: Network, place: int, episodes: Sequence[PageEpisode]) -> Values:
     """Return a substance with the scale of its colours, that of all episodes together."""
     id_, nodes = network.substances[place].id, len(network.nodes)
-    shown = [(episode.flow, episode.contents[:, place, nodes:]) for episode in episodes if episode.contents is not None]
-    flow = np.concatenate([flow.ravel() for flow, _ in shown] or [np.empty(0)])
-    contents = np.concatenate([parts.ravel() for _, parts in shown] or [np.empty(0)])
+    runs = [episode.rollout for episode in episodes if len(episode.rollout.contents)]
+    flow = np.concatenate([run.flow.ravel() for run in runs] or [np.empty(0)])
+    contents = np.concatenate([run.contents[:, place, nodes:].ravel() for run in runs] or [np.empty(0)])
     colours = ContentColours(readable(id_), contents, flow)
     steps = [[colour, text] for colour, text in colours.steps.items()]
     return {"id": id_, "label": readable(id_), "highest": _number(colours.highest), "steps": steps}
@@ -172,22 +173,21 @@ def _sources(numbers: Iterable[StatedNumber]) -> list[list[str]]:
 
 
 def _episode(episode: PageEpisode, network: int) -> Values:
-    start = np.full(len(episode.network.stores), np.nan) if episode.start is None else episode.start
-    contents = np.empty((len(episode.flow), 0, 0)) if episode.contents is None else episode.contents
-    stocks, throughput = np.concatenate([start[None], episode.stock]).T, episode.network.throughput(episode.flow.T)
+    run, throughput = episode.rollout, episode.network.throughput(episode.rollout.flow.T)
+    contents = run.contents.swapaxes(0, 1) if len(run.contents) else ()
     return {
         "name": episode.name,
         "plan": episode.name in (PLAN, "optimum"),
         "network": network,
         "scenario": episode.network.scenario_name,
-        "levels": [_list(row) for row in (*stocks, *throughput)],
-        "flows": [_list(row) for row in episode.flow.T],
-        "controls": None if episode.controls is None else [_list(row) for row in episode.controls.T],
+        "levels": [_list(row) for row in (*np.vstack([run.start, run.stock]).T, *throughput)],
+        "flows": [_list(row) for row in run.flow.T],
+        "controls": [_list(row) for row in run.controls.T] if len(run.controls) else None,
         "lambda": _band(episode.bands["circularity"][0]),
         "services": [*map(_band, episode.bands["service"])],
         "disturbances": [*map(_band, episode.bands["disturbance"])],
         "accounts": [*map(_band, episode.bands["account"])],
-        "contents": [[_list(row) for row in part.T] for part in contents.swapaxes(0, 1)],
+        "contents": [[_list(row) for row in part.T] for part in contents],
         "about": episode.about,
         "figures": {name: [*map(_number, astuple(f))] for name, f in episode.figures.items() if f is not None},
     }

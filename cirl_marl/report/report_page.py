@@ -53,18 +53,14 @@ class PageEpisode:
     name: Annotated[str, "who acts, or under which scenario"]
     network: Annotated[Network, "the network under its scenario"]
     agents: Annotated[tuple[str, ...], "who acts"]
-    start: Annotated[Floats | None, "stocks at the start, shape (stores,), mass; None if there are several"]
-    stock: Annotated[Floats, "stocks at the end of each interval, shape (steps, stores), mass"]
-    flow: Annotated[Floats, "mean flows of each interval, shape (steps, arcs), mass/time"]
-    controls: Annotated[Floats | None, "values of all controls, shape (steps, controls); None if they are not known"]
+    rollout: Annotated[
+        Rollout, "what became of it; the start is NaN, and controls and contents have no rows, if unknown"
+    ]
     bands: Annotated[Mapping[QuantityKind, tuple[Band, ...]], "of λ, services, disturbances and accounts, by kind"]
     about: Annotated[str, "what the bands are; empty if there are none"] = ""
     figures: Annotated[Mapping[str, Aggregate | None], "figures of whole episodes, of ``comparison.FIGURES``"] = field(
         default_factory=dict
     )
-    contents: Annotated[
-        Floats | None, "of each substance in nodes and flows, shape (steps, substances, compartments); None: not known"
-    ] = None
 
 
 @positional_record
@@ -107,21 +103,15 @@ def page_of_samples(samples: SampledEpisodes, control: str) -> ReportPage:
     Flows and stocks are means, which balance as medians do not.
     """
     network, run, count = samples.network, samples.rollout, len(samples.factors)
-    episode = PageEpisode(
-        name=readable(control),
-        network=network,
-        agents=network.agents,
-        start=None,
-        stock=run.stock.mean(axis=0),
-        flow=run.flow.mean(axis=0),
-        controls=None,
-        bands=_bands(network, run, lambda quantity, values: _quantiles(values)),
-        about=SAMPLES.format(count),
-    )
+    bands = _bands(network, run, lambda quantity, values: _quantiles(values))
+    unknown = replace(run, start=np.full_like(run.start, np.nan), controls=run.controls[:0], contents=run.contents[:0])
+    mean = replace(unknown, stock=run.stock.mean(axis=0), flow=run.flow.mean(axis=0))
+    episode = PageEpisode(readable(control), network, network.agents, mean, bands, SAMPLES.format(count))
 
     def draw(i: int) -> PageEpisode:
         bands = _bands(network, run, lambda quantity, values: Band(values[i]))
-        return replace(episode, name=f"sample {i}", stock=run.stock[i], flow=run.flow[i], bands=bands, about="")
+        single = replace(mean, stock=run.stock[i], flow=run.flow[i])
+        return PageEpisode(f"sample {i}", network, network.agents, single, bands)
 
     draws = map(draw, range(min(SHOWN, count)))
     note = f"Flows and stocks are means of {count} samples of what is uncertain or disturbed."
@@ -230,19 +220,8 @@ def _episode(
     figures = {**figures, **{which: Aggregate(share, np.nan, np.nan) for which, share in shares.items()}}
     accounts = episode_quantities(network, "account")
     figures |= {f"account:{account.of}": over_episodes(account.totals(outcome)) for account in accounts}
-    return PageEpisode(
-        name=name,
-        network=network,
-        agents=agents,
-        start=outcome.start,
-        stock=outcome.stock,
-        flow=outcome.flow,
-        controls=outcome.controls,
-        bands=_bands(network, outcome, _mean),
-        about=CONFIDENCE.format(count) if count > 1 else "",
-        figures=figures,
-        contents=outcome.contents,
-    )
+    about = CONFIDENCE.format(count) if count > 1 else ""
+    return PageEpisode(name, network, agents, outcome, _bands(network, outcome, _mean), about, figures)
 
 
 def _bands(
