@@ -130,19 +130,6 @@ def test_a_donor_that_has_nothing_sends_nothing() -> None:
     assert env.physical.service[0, 0] == 5.0
 
 
-@given(network=batch_networks, seed=st.integers(0, 1000))
-def test_a_copy_with_batches_is_a_lone_environment(network: Network, seed: int) -> None:
-    """Copy 1 of three is to the bit what starts alone with its seed."""
-    env, masses = rollout_of(network, 3, seed)
-    lone = MultiAgentVectorEnv(network, num_envs=1)
-    lone.reset(seed=seed + 1)
-    random = np.random.default_rng(seed)
-    for table in masses[1:]:
-        lone.advance(random.uniform(-1, 1, (len(lone.actuators.control_rows), 1)))
-        np.testing.assert_array_equal(lone.physical.stock[:, 0], table[:, 1])
-    np.testing.assert_array_equal(lone.physical.circularity[0], env.physical.circularity[1])
-
-
 @given(seed=st.integers(0, 2**32 - 1), nodes=st.integers(2, 8), arcs=st.integers(2, 16))
 def test_what_is_in_batches_changes_no_mass(seed: int, nodes: int, arcs: int) -> None:
     """Where nothing is separated stocks, loads and λ, m_fb in it, are those of the network without substances."""

@@ -12,6 +12,8 @@ from conftest import random_network
 from hypothesis import example, given
 from hypothesis import strategies as st
 from small_networks import PLAYED, disturbed_networks
+from test_batch_contents import batch_networks
+from test_substances import substances_networks
 
 from cirl_marl import Law, MultiAgentVectorEnv, Network, SingleAgentEnv, load_network, parallel_env
 from cirl_marl.network.elements import REWARDS
@@ -106,13 +108,18 @@ def assert_batch_is_lone(network: Network, seed: int, reward: str) -> None:
                 np.testing.assert_array_equal(infos[agent]["flows"], outcome.flow[:, i])
                 assert truncations[agent] == outcome.truncated[i]
             np.testing.assert_array_equal(env.state(), batch.state()[i])
+            np.testing.assert_array_equal(env.batch.physical.stock[:, 0], batch.physical.stock[:, i])
+            np.testing.assert_array_equal(env.batch.physical.substances[:, 0], batch.physical.substances[:, i])
 
 
 @pytest.mark.medium
-@given(network=any_network, seed=st.integers(0, 2**31), reward=st.sampled_from(REWARDS))
-def test_random_batch_equals_lone(network: Network, seed: int, reward: str) -> None:
+@pytest.mark.parametrize("networks", [any_network, substances_networks, batch_networks])
+@given(data=st.data(), seed=st.integers(0, 2**31), reward=st.sampled_from(REWARDS))
+def test_random_batch_equals_lone(
+    networks: st.SearchStrategy[Network], data: st.DataObject, seed: int, reward: str
+) -> None:
     """Same seed, same bits; a copy of a batch equals a lone environment, and all views agree."""
-    assert_batch_is_lone(network, seed, reward)
+    assert_batch_is_lone(data.draw(networks), seed, reward)
 
 
 @pytest.mark.sample(15)

@@ -14,6 +14,7 @@ from conftest import random_network, with_substances
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from test_invariants import assert_batch_is_lone
 
 from cirl_marl import (
     Arc,
@@ -28,7 +29,6 @@ from cirl_marl import (
     Series,
     Service,
     load_network,
-    parallel_env,
 )
 from cirl_marl.controllers import Constant, Neutral
 from cirl_marl.controllers.lint import lint_warnings
@@ -624,19 +624,7 @@ def test_services_that_hang_together_are_all_met() -> None:
 @pytest.mark.parametrize("network", [cycle("lifetimes"), town((0.25, 0.75))])
 def test_copies_are_lone_environments(network: Network) -> None:
     """To the bit."""
-    acting = [network.agents[-1]]
-    batch = MultiAgentVectorEnv(network, num_envs=3, agents=acting)
-    batch.reset(7)
-    alone = [parallel_env(network, agents=acting) for _ in range(3)]
-    for i, env in enumerate(alone):
-        env.reset(7 + i)
-    rng = np.random.default_rng(0)
-    for _ in range(5):
-        actions = rng.uniform(-1, 1, (1, 3)).astype(np.float32)
-        flows = batch.advance(actions.astype(float)).flow
-        for i, env in enumerate(alone):
-            infos = env.step({acting[0]: actions[:, i]})[-1]
-            np.testing.assert_array_equal(infos[acting[0]]["flows"], flows[:, i])
+    assert_batch_is_lone(replace(network, default_agents=network.agents[-1:]), 7, "local")
 
 
 @pytest.mark.slow
