@@ -101,6 +101,28 @@ def test_kernels_enclose_what_leaves(distribution: str, deviation: float, mean: 
         assert (high - low).max() < (2e-3 if degree == 1 else 2e-4) * left.max()
 
 
+@pytest.mark.parametrize("is_stretched", [False, True])
+@pytest.mark.parametrize("seed", range(3))
+def test_an_exponential_lifetime_is_a_rate(seed: int, is_stretched: bool) -> None:
+    """Bounds and their plans are those of a stock that leaves in proportion to itself, in as many pieces."""
+    rng = np.random.default_rng(seed)
+    mean, most = float(10 ** rng.uniform(-0.3, 1.5)), float(rng.uniform(1.1, 2.0))
+    stretch = Control(kind=ControlKind.STRETCH, low=1.0 / most, neutral=1.0, high=most) if is_stretched else None
+    valve = Control(kind=ControlKind.RATE, low=1.0 / most, neutral=1.0, high=most) if is_stretched else None
+    lifetime = Lifetime(mean=mean, distribution="exponential")
+    living = town(lifetime, rng.uniform(5.0, 20.0, 6), initial=float(rng.uniform(5.0, 50.0)), control=stretch)
+    use = replace(living.nodes[1], lifetime=None, rate=1.0 / mean, control=valve)
+    service = Service(id="in_use", provider="use", quantity="stock", low=float(rng.uniform(5.0, 40.0)))
+    living = replace(living, services=(service,), default_agents=("use",) if is_stretched else ())
+    leaving = replace(living, nodes=(living.nodes[0], use, living.nodes[2]))
+    for degree in (1, 2):
+        bounds = [bound(network, service_weight=10.0, degree=degree) for network in (living, leaving)]
+        assert bounds[0].objective == pytest.approx(bounds[1].objective, rel=1e-7)
+        assert len({found.problem.layout.pieces for found in bounds}) == 1
+        runs = [simulate_plan(found) for found in bounds]
+        np.testing.assert_allclose(runs[0].flow, runs[1].flow, rtol=1e-4)
+
+
 @pytest.mark.parametrize("mean", [3.0, 30.0])
 def test_what_is_new_counts_in_each_row_as_if_it_had_been_there(mean: float) -> None:
     """A unit of mass at the start adds to the limits of rows what ``of_new`` says, whichever rows there are."""

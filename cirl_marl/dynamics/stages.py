@@ -84,17 +84,19 @@ class StagedNetwork(Network):
         return {node: arc for node, arc in with_stages.items() if arcs[arc].law is Law.EXOGENOUS}
 
 
-def staged_network(network: Network, whole: Container[str] = ()) -> StagedNetwork:
+def staged_network(network: Network, whole: Container[str] = (), *, plain: Container[str] = ()) -> StagedNetwork:
     """Return ``network`` with its lifetimes as chains and lines.
 
     Of nodes that stay ``whole`` the release arc alone is written, with the rate of the stages, or 1 for a line:
-    what it carries does not follow from the stock.
+    what it carries does not follow from the stock. Those of a single stage may be ``plain``: stocks with that rate.
     """
     with_lifetime = [node for node in network.stores if node.lifetime is not None]
     parts = _Parts(network)
     for node in with_lifetime:
         assert node.lifetime is not None
-        if node.id in whole:
+        if node.id in plain:
+            parts.stock(node)
+        elif node.id in whole:
             parts.whole(node)
         elif node.lifetime.chain is None:
             parts.line(node)
@@ -106,8 +108,11 @@ def staged_network(network: Network, whole: Container[str] = ()) -> StagedNetwor
         )
         for arc in network.arcs
     ]
-    plain = {n.id: Node(id=n.id, role=n.role, scale=n.scale, control=n.control) for n in with_lifetime}
-    stores = [plain.get(node.id, node) for node in network.stores]
+    last = {
+        n.id: Node(id=n.id, role=n.role, scale=n.scale, control=n.control, rate=parts.rates.get(n.id, 0.0))
+        for n in with_lifetime
+    }
+    stores = [last.get(node.id, node) for node in network.stores]
     stockless = [Node(id=item, stores=False) for item in (*parts.enters.values(), *parts.leaves.values())]
     fields_ = {item: getattr(network, item) for item in network.__dataclass_fields__}
     fields_ |= {"nodes": (*stores, *parts.stores, *network.nodes[len(stores) :], *stockless), "scenarios": {}}
@@ -130,6 +135,12 @@ class _Parts:
         self.valves: dict[str, str] = {}
         self.release_arcs: dict[str, str] = {}
         self.of: dict[str, str] = {}
+        self.rates: dict[str, Value] = {}
+
+    def stock(self, node: Node) -> None:
+        """Let a lifetime of a single stage be a stock that leaves in proportion to itself."""
+        self.stages[node.id], self.valves[node.id] = (node.id,), node.id
+        self.rates[node.id] = self._rate(node)
 
     def chain(self, node: Node) -> None:
         """Add the stages of a lifetime that is spread."""

@@ -348,7 +348,7 @@ def normalised_actions(
 
     v = Z̄/X̄ where a node has several outflows, else the most that its outflow or orders ask with their own controls
     neutral; then w_k = f̄_k/(a_k·v·X̄_p) and u_k = f̄_k/v, each clipped to its range. A share is such a w_k, of what is
-    released. A stretch is what leaves the planned stock at the end of the interval.
+    released. A stretch is what leaves the planned stock at the end of the interval, of a single stage it is 1/v.
 
     Args:
         admissible: ranges of the factors.
@@ -396,7 +396,8 @@ def normalised_actions(
         elif control.kind is ControlKind.RATE:
             physical = valve[:, network.node_index[agent]]
         elif control.kind is ControlKind.STRETCH:
-            physical = stretches[agent]
+            node = network.node_index[agent]
+            physical = stretches[agent] if agent in stretches else 1.0 / valve[:, node]
         else:
             outflows = np.flatnonzero(network.donors == network.node_index[agent])
             physical = setting[:, next(k for k in outflows if network.arcs[k].law is Law.CONTROLLED)]

@@ -12,7 +12,8 @@ not negative, neither are any of the means in
     known_i + w_0 U_i + Σ_q Σ_j c̲_j U_qj ≤ L_i ≤ known_i + w_0 U_i + Σ_q Σ_j c̄_j U_qj
 
 (theorem 4 of docs/bound.md). What leaves a fixed lifetime is the mean inflow of one interval, or known. Rows of
-lifetimes that an agent stretches: ``stretched``.
+lifetimes that an agent stretches: ``stretched``. One of a single stage is a stock that leaves in proportion to itself:
+laws of flows hold it exactly, in any pieces, which a kernel that jumps where τ = t does not.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from cirl_marl.dynamics.stages import StagedNetwork, staged_network
 from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import positional_record
-from cirl_marl.network.elements import Node
+from cirl_marl.network.elements import Lifetime, Node
 from cirl_marl.network.lifetimes import Chain
 from cirl_marl.network.substances import follows_contents
 from cirl_marl.optimum.kernels import Kernel, unit_outflow
@@ -94,7 +95,7 @@ class Lifetimes:
         state_layout: which row of its stocks is what.
         plan_network: as the program has it; where contents matter, with a copy for each substance.
         reach_network: as stocks are bounded, all lifetimes but fixed ones being chains.
-        whole: the lifetimes, of each component its own if the program has components.
+        whole: the lifetimes of more than one stage, of each component its own if the program has components.
         exit_arcs: arcs of the planned network that come out of these.
         most_factor: most that multiplies what comes out of each, shape (steps, lifetimes).
         start_planned: what the stores of the planned network hold of the stocks of the simulator, (stores, stocks).
@@ -114,11 +115,13 @@ class Lifetimes:
         self.state_layout = StateLayout(self.simulator_network)
         self.whole: list[WholeLifetime] = []
         self.cache = IntervalCache()
-        nodes = [node for node in network.stores if node.lifetime is not None]
+        with_lifetime = [node for node in network.stores if node.lifetime is not None]
+        nodes = [node for node in with_lifetime if not _is_stock(node.lifetime)]
         separate = follows_contents(network) and not isinstance(network, ComponentNetwork)
-        if nodes or separate:
+        if with_lifetime or separate:
             fixed_nodes = [node.id for node in nodes if node.lifetime is not None and node.lifetime.chain is None]
-            plan, reach = (staged_network(network, whole) for whole in ({node.id for node in nodes}, fixed_nodes))
+            plain = {node.id for node in with_lifetime} - (lives := {node.id for node in nodes})
+            plan, reach = (staged_network(network, whole, plain=plain) for whole in (lives, fixed_nodes))
             if separate:
                 plan, reach = component_network(plan), component_network(reach)
             self.plan_network, self.reach_network = plan, reach if nodes else plan
@@ -351,6 +354,12 @@ class Lifetimes:
         shift = sparse.eye_array(steps, k=-delay) if delay < steps else sparse.csr_array((steps, steps))
         kernel = sparse.csr_array(sparse.kron(shift, np.full((moments, moments), 1.0 / moments)))
         return kernel, kernel, from_start.ravel()
+
+
+def _is_stock(lifetime: Lifetime | None) -> bool:
+    """Whether a life is that of a stock that leaves in proportion to itself: one stage, into which all enters."""
+    chain = None if lifetime is None else lifetime.chain
+    return chain is not None and chain.stages == 1 and chain.weights[0] == 0
 
 
 def _column_sums(columns: Integers, width: int) -> Any:
