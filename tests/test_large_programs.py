@@ -303,7 +303,7 @@ def test_values_fit_that_miss_no_row_and_no_box(values: list[float], fits: bool)
     assert solver._ScaledProgram(problem, np.ones(2)).is_feasible(answer) == fits
 
 
-@pytest.mark.parametrize(("distance", "count"), [(0.5 * solver.FAIR, 3), (2.0 * solver.FAIR, 4)])
+@pytest.mark.parametrize(("distance", "count"), [(0.5 * solver.FAIR, 2), (2.0 * solver.FAIR, 4)])
 def test_simplex_is_tried_where_interior_points_do_not_do(
     monkeypatch: pytest.MonkeyPatch, distance: float, count: int
 ) -> None:
@@ -325,6 +325,22 @@ def test_simplex_is_tried_where_interior_points_do_not_do(
     assert tried == [*solver.SETTINGS][:count]
 
 
+def test_a_proof_of_many_variables_waits_for_no_crossover(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interior points alone are tried first, and are near enough at 1e-4."""
+    problem = bound("copper_net", min_service=0.9, degree=1, horizon=4).problem
+    tried, run = list[Any](), solver._ScaledProgram.run
+
+    def noted(scaled: Any, options: Any, start: Any, **others: Any) -> Any:
+        tried.append(options)
+        return run(scaled, options, start, **others)
+
+    monkeypatch.setattr(solver._ScaledProgram, "run", noted)
+    monkeypatch.setattr(solver._ScaledProgram, "distance", lambda *_: (solver.OPTIMAL + solver.FAIR) / 2)
+    monkeypatch.setattr(solver, "PROOF_PROGRAM", len(problem.cost))
+    solver.solve(problem)
+    assert tried == [solver.INTERIOR_SETTINGS[0]]
+
+
 @pytest.mark.slow
 def test_interior_points_alone_leave_good_multipliers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a generated cycle in merged pieces, where rows that presolve merges as parallel spoil them."""
@@ -338,7 +354,7 @@ def test_interior_points_alone_leave_good_multipliers(monkeypatch: pytest.Monkey
         return distances[-1]
 
     monkeypatch.setattr(solver._ScaledProgram, "distance", noted)
-    monkeypatch.setattr(solver, "BASIS_PROGRAM", 0)
+    monkeypatch.setattr(solver, "PROOF_PROGRAM", 0)
     assert solver.solve(problem).basis is None
     assert len(distances) == 1 and distances[0] <= solver.OPTIMAL
     first = dict(solver.INTERIOR_SETTINGS[0])
