@@ -130,6 +130,13 @@ def test_bounds_of_worlds_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert (
         run["gap"]["value"] == found.gaps(*outcomes(found, foresight.CONTENDERS["price_policy"](world, found))).mean()
     )
+    planner = foresight.CONTENDERS["price_policy"](world, again)()
+    neutral_gaps = foresight.played(again, again.network, Neutral(), 8)[1]
+    less = foresight.less_than_planner(again, [Neutral(), planner], run["gap_by_draw"][:8])
+    own = np.array(run["gap_by_draw"][:8]) - neutral_gaps
+    np.testing.assert_allclose(less["by_seed"], [own.mean(), 0.0], atol=1e-12)
+    half_width = 2.365 * own.std(ddof=1) / 2 / 8**0.5  # Student, seven degrees of freedom
+    np.testing.assert_allclose([less["value"], less["high"] - less["value"]], [own.mean() / 2, half_width], rtol=1e-3)
     with pytest.raises(TypeError):
         foresight.proof(world, replace(sampling, seed=1))
 
