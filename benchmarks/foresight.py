@@ -405,7 +405,6 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=200, help="of which the bound is the mean")
     parser.add_argument("--fit-draws", type=int, default=64, help="others, to which prices are fitted")
     parser.add_argument("--tune", type=int, default=32, help="draws on which margins of those that plan are set")
-    parser.add_argument("--kept-knobs", action="store_true", help="margins of kept rows instead, as they were set")
     parser.add_argument("--seeds", type=int, default=2, help="trainings of learners, which take turns in the draws")
     parser.add_argument("--steps", type=int, help="of a training; default: the recipe's")
     parser.add_argument("--episodes", type=int, default=64, help="of those that plan for every decision")
@@ -428,13 +427,9 @@ def main() -> None:
             continue
         for name in options.only.split(","):
             episodes = min(options.episodes, options.draws) if name in PLANNERS else options.draws
-            seen, tune, margin, setting = found, options.tune, 1.0, dict[str, Any]()
+            seen, tune, margin = found, options.tune, 1.0
             if name in SIMPLE:
                 tune, margin = None, json.loads(KNOBS.read_text())[world.network]["contenders"][name]["knob"]
-            elif options.kept_knobs and name in CONTENDERS:
-                kept = json.loads(RESULTS.read_text())[world.network]["contenders"][name]
-                setting = {key: kept[key] for key in ("tuned_on", "excess")}
-                tune, margin = None, kept["knob"]
             if name in LEARNERS:
                 seen = replace(found, network=seen_by(found.network, "local"))
                 seeds = range(1, options.seeds + 1)
@@ -442,7 +437,7 @@ def main() -> None:
                 tune, make = None, _whatever_margin(Alternating(teams))
             else:
                 make = CONTENDERS[name](world, found)
-            figures = setting | measured(name, make, seen, tune, episodes, margin)
+            figures = measured(name, make, seen, tune, episodes, margin)
             results = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {}
             entry = results.get(world.network, {})
             rows = entry.get("contenders", {})
