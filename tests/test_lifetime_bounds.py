@@ -123,6 +123,15 @@ def test_an_exponential_lifetime_is_a_rate(seed: int, is_stretched: bool) -> Non
         np.testing.assert_allclose(runs[0].flow, runs[1].flow, rtol=1e-4)
 
 
+def test_exponential_lifetimes_that_serve_together_stay_lifetimes() -> None:
+    """What they lack together is bounded from what entered each; of one alone a stock tells the same."""
+    network = town(Lifetime(mean=4.0, distribution="exponential"), INFLOW[:3], initial=30.0)
+    for also, whole in (((), []), (("dump",), ["use"])):
+        service = Service(id="in_use", provider="use", also=also, quantity="stock", low=5.0)
+        lifetimes = Admissible.of(replace(network, services=(service,))).lifetimes
+        assert [lifetime.node.id for lifetime in lifetimes.whole] == whole
+
+
 @pytest.mark.parametrize("mean", [3.0, 30.0])
 def test_what_is_new_counts_in_each_row_as_if_it_had_been_there(mean: float) -> None:
     """A unit of mass at the start adds to the limits of rows what ``of_new`` says, whichever rows there are."""

@@ -95,7 +95,7 @@ class Lifetimes:
         state_layout: which row of its stocks is what.
         plan_network: as the program has it; where contents matter, with a copy for each substance.
         reach_network: as stocks are bounded, all lifetimes but fixed ones being chains.
-        whole: the lifetimes of more than one stage, of each component its own if the program has components.
+        whole: the lifetimes that are no plain stocks, of each component its own if the program has components.
         exit_arcs: arcs of the planned network that come out of these.
         most_factor: most that multiplies what comes out of each, shape (steps, lifetimes).
         start_planned: what the stores of the planned network hold of the stocks of the simulator, (stores, stocks).
@@ -116,7 +116,9 @@ class Lifetimes:
         self.whole: list[WholeLifetime] = []
         self.cache = IntervalCache()
         with_lifetime = [node for node in network.stores if node.lifetime is not None]
-        nodes = [node for node in with_lifetime if not _is_stock(node.lifetime)]
+        # what several stocks lack together is less loose of lifetimes (``shortages``)
+        together = {id_ for service in network.services if len(service.providers) > 1 for id_ in service.providers}
+        nodes = [node for node in with_lifetime if node.id in together or not _is_stock(node.lifetime)]
         separate = follows_contents(network) and not isinstance(network, ComponentNetwork)
         if with_lifetime or separate:
             fixed_nodes = [node.id for node in nodes if node.lifetime is not None and node.lifetime.chain is None]
