@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 import signal
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import highspy
 import numpy as np
@@ -433,15 +433,20 @@ def test_a_solver_that_runs_hears_of_ctrl_c(method: str) -> None:
     rng, size = np.random.default_rng(0), 40
     heard: list[int] = []
 
-    class Interrupted(highspy.Highs):  # type: ignore[misc]
+    def press(_: Any) -> None:
+        if not heard:
+            heard.append(1)
+            signal.raise_signal(signal.SIGINT)
+
+    class Interrupted(highspy.Highs):
         """Is interrupted in its first iteration."""
 
         def run(self) -> Any:
             for callback in (self.cbSimplexInterrupt, self.cbIpmInterrupt):
-                callback += lambda _: heard or [heard.append(1), signal.raise_signal(signal.SIGINT)]
+                callback += press
             return super().run()
 
-    highs = Interrupted()
+    highs: Any = cast(Any, Interrupted)()
     highs.setOptionValue("output_flag", False)
     highs.setOptionValue("solver", method)
     highs.setOptionValue("presolve", "off")
