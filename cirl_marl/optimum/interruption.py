@@ -9,7 +9,7 @@ from typing import Any
 
 import highspy
 
-SLOW_PROGRAM = 2_000
+SLOW_PROGRAM = 15_000
 """Variables from which on a program may take longer than somebody likes to wait; to look costs others time."""
 
 
