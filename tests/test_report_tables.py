@@ -163,7 +163,7 @@ def test_what_a_page_says_of_a_service() -> None:
 
 
 def _page_episode(network: Network) -> Any:
-    return SimpleNamespace(flow=np.ones((2, 3)), agents=(), contents=None, network=network)
+    return SimpleNamespace(rollout=SimpleNamespace(flow=np.ones((2, 3))), agents=(), network=network)
 
 
 def test_ages_at_the_start_and_at_the_end_are_told_apart(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
