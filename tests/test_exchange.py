@@ -233,7 +233,10 @@ def test_tables_and_pages_have_every_quantity(seed: int) -> None:
         assert len({(part.kind, part.of, part.substance) for part in quantities}) == len(quantities)
         for part in quantities:
             times, curve = part.points(network, run)
-            assert len(times) == len(curve) == steps + (part.kind == "stock")
+            ends = network.episode.control_interval * np.arange(1, steps + 1)
+            moments = [0.0, *ends] if part.kind == "stock" else ends - network.episode.control_interval / 2
+            assert len(times) == len(curve)
+            np.testing.assert_allclose(times, moments)
             if part.kind != "service":  # of which the table has the mean
                 np.testing.assert_array_equal(columns[part.heading], part.values(run)[0])
             if part.kind == "stock":
