@@ -17,12 +17,12 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl import CirlError, DefinitionError, LearnerError, RecipeError
 from cirl_marl.learners.checkpoint import observation_statistics
-from cirl_marl.learners.interface import Trained, _learn_first, prepare, resume, train
+from cirl_marl.learners.interface import Trained, _learn_first, prepare, resume, train, train_seeds
 from cirl_marl.learners.learner import Learner, load_acting_learner
 from cirl_marl.learners.recipe import Recipe, load_recipe
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.learners.start import _other_settings
-from cirl_marl.learners.trainer import Training
+from cirl_marl.learners.trainer import Progress, Training
 
 AGENTS = ["mine", "use"]
 OPTIONS: dict[str, Any] = {"agents": AGENTS, "horizon": 4}
@@ -335,7 +335,7 @@ def test_what_acts_is_that_of_a_recipe_that_learnt_first(recipe_first: Path, tmp
     source = RunDirectory(tmp_path / "first")
     groups = {group.name: group for group in source.groups()}
     found, fresh = (prepare("copper_net", after(recipe_first), seed=7, **OPTIONS) for _ in range(2))
-    _learn_first(found, "cpu")
+    _learn_first([found], None, "cpu")
     for name in AGENTS:
         acted = load_acting_learner(source.acting_checkpoint, groups[name], source.make_env(1))
         old, new, plain = map(weights, (acted, found.learners[name], fresh.learners[name]))
@@ -355,18 +355,27 @@ def test_each_learner_has_the_recipe_and_the_steps_that_it_names(recipe_first: P
     both = prepare("copper_net", recipe(matches=[{"agents": ["mine"], "start": longer}], start=guess), **OPTIONS)
     lone = [prepare("copper_net", recipe(start=start), **OPTIONS) for start in (guess, longer)]
     for training in (both, *lone):
-        _learn_first(training, "cpu")
+        _learn_first([training], None, "cpu")
     usual, late = lone
     assert same(weights(both.learners["mine"]), weights(late.learners["mine"]))
     assert same(weights(both.learners["use"]), weights(usual.learners["use"]))
     assert not same(weights(late.learners["use"]), weights(usual.learners["use"]))
 
 
+def test_progress_counts_what_learns_first(recipe_first: Path) -> None:
+    """Of all that is to be done, for each of two seeds 24 steps, and 24 of both after them."""
+    reports: list[Progress] = []
+    train_seeds("copper_net", after(recipe_first), seeds=(0, 1), report=reports.append, **OPTIONS)
+    steps, seconds = ([getattr(now, name) for now in reports] for name in ("env_steps", "seconds"))
+    assert steps == [*range(2, 74, 2)] and {now.total for now in reports} == {72}
+    assert seconds == sorted(seconds)
+
+
 @pytest.mark.parametrize("engine", ["lockstep", "stacked"])
 def test_critics_learn_what_the_state_is_like_after_a_recipe(recipe_first: Path, engine: str) -> None:
     """Statistics of what agents see stay, those of the state follow; both engines learn the same."""
     first = prepare("copper_net", after(recipe_first), **OPTIONS)
-    _learn_first(first, "cpu")
+    _learn_first([first], None, "cpu")
     found = train("copper_net", after(recipe_first), engine=engine, **OPTIONS)
     lone = train("copper_net", after(recipe_first), engine="lockstep", **OPTIONS)
     for name in AGENTS:

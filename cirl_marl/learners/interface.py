@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import inspect
 import tempfile
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +32,7 @@ from cirl_marl.learners.policies import Policies
 from cirl_marl.learners.recipe import ENGINES, OPTIONS, Recipe, load_recipe
 from cirl_marl.learners.run_directory import RunConfig, RunDirectory
 from cirl_marl.learners.stacked.conditions import check_device
-from cirl_marl.learners.trainer import Progress, Training, run_together
+from cirl_marl.learners.trainer import Progress, Training, TrainingReport, run_together
 from cirl_marl.network import Network
 from cirl_marl.records.files import publish_folder
 
@@ -55,7 +58,7 @@ def train(
     seed: int = 0,
     agents: Sequence[str] | None = None,
     callbacks: Mapping[str, BaseCallback] | None = None,
-    report: Callable[[Progress], None] | None = None,
+    report: TrainingReport | None = None,
     device: str = "cpu",
     checkpoint_every: float | None = None,
     **options: Any,
@@ -102,7 +105,7 @@ def train_seeds(
     *,
     seeds: Sequence[int],
     directory: str | Path | None = None,
-    report: Callable[[Progress], None] | None = None,
+    report: TrainingReport | None = None,
     device: str = "cpu",
     **options: Any,
 ) -> list[Training]:
@@ -122,7 +125,7 @@ def _train(
     runs: Sequence[tuple[int, str | Path | None]],
     *,
     callbacks: Mapping[str, BaseCallback] | None = None,
-    report: Callable[[Progress], None] | None = None,
+    report: TrainingReport | None = None,
     device: str,
     **options: Any,
 ) -> list[Training]:
@@ -133,8 +136,7 @@ def _train(
         for training in trainings:
             training.check_callbacks(callbacks or {})
             training.stackable(callbacks or {})
-        for training in trainings:
-            _learn_first(training, device)
+        report = _learn_first(trainings, report, device)
         for (_, directory), training in zip(runs, trainings, strict=True):
             if directory is not None:
                 run = claims.enter_context(create_run(Path(directory), training.config, training.env.network))
@@ -143,20 +145,43 @@ def _train(
     return trainings
 
 
-def _learn_first(training: Training, device: str) -> None:
-    """Train the recipes with which learners begin, in the same network and with the same seed; give them what acts."""
-    env, config = training.env, training.config
-    recipes = {name: (start.recipe, start.steps) for name, start in training.starts.items() if start.recipe}
-    options = {key: config.options[key] for key in ("observe", "horizon", "uncertain") if key in config.options}
-    for recipe, steps in dict.fromkeys(recipes.values()):
-        first = prepare(env.network, recipe, steps=steps, seed=config.seed, agents=env.agents, **options)
+def _learn_first(trainings: Sequence[Training], report: TrainingReport | None, device: str) -> TrainingReport | None:
+    """Train what learners begin with, and give them what acts there; return what reports the trainings themselves.
+
+    All are reported as parts of one.
+    """
+    stages = [(training, *stage) for training in trainings for stage in _first_trainings(training)]
+    began, done = time.perf_counter(), 0
+    total = sum(first.config.steps for _, _, first in stages) + trainings[0].config.steps
+
+    def part(steps: int) -> TrainingReport | None:
+        return None if report is None else partial(_report_part, report, began, done, total - steps)
+
+    for training, names, first in stages:
         with (
             tempfile.TemporaryDirectory() as folder,
             create_run(Path(folder) / "run", first.config, first.env.network) as run,
         ):
             first.keep_in(run)
-            run_together([first], device=device)
-            training.begin_from({name: run.path for name, key in recipes.items() if key == (recipe, steps)})
+            run_together([first], report=part(first.config.steps), device=device)
+            training.begin_from(dict.fromkeys(names, run.path))
+        done += first.config.steps
+    return part(trainings[0].config.steps)
+
+
+def _first_trainings(training: Training) -> Iterator[tuple[list[str], Training]]:
+    """Yield each recipe with which learners begin, to be trained in the same network and with the same seed."""
+    env, config = training.env, training.config
+    recipes = {name: (start.recipe, start.steps) for name, start in training.starts.items() if start.recipe}
+    options = {key: config.options[key] for key in ("observe", "horizon", "uncertain") if key in config.options}
+    for recipe, steps in dict.fromkeys(recipes.values()):
+        names = [name for name, key in recipes.items() if key == (recipe, steps)]
+        yield names, prepare(env.network, recipe, steps=steps, seed=config.seed, agents=env.agents, **options)
+
+
+def _report_part(report: TrainingReport, began: float, done: int, others: int, now: Progress) -> None:
+    seconds = time.perf_counter() - began
+    report(replace(now, env_steps=done + now.env_steps, total=others + now.total, seconds=seconds))
 
 
 def prepare(
@@ -209,7 +234,7 @@ def resume(
     *,
     steps: int | None = None,
     callbacks: Mapping[str, BaseCallback] | None = None,
-    report: Callable[[Progress], None] | None = None,
+    report: TrainingReport | None = None,
     device: str = "cpu",
     checkpoint_every: float | None = None,
 ) -> Training:
@@ -241,7 +266,7 @@ def resume(
             warnings.warn(f"{run.path}: other versions may give other bits: {'; '.join(version_changes)}", stacklevel=2)
         training, checkpoint = _from_newest_checkpoint(run, config, checkpoint_every)
         if checkpoint is None:
-            _learn_first(training, device)
+            report = _learn_first([training], report, device)
         training.check_callbacks(callbacks or {})
         run.reopen(config, checkpoint)
         training.keep_in(run)
@@ -330,7 +355,7 @@ def complete_run(
     network: str | Path | Network,
     recipe: Recipe,
     *,
-    report: Callable[[Progress], None] | None = None,
+    report: TrainingReport | None = None,
     checkpoint_every: float | None = None,
     **options: Any,
 ) -> RunDirectory:
