@@ -13,7 +13,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 from test_changing_contents import NOISE, mine
-from test_substances import sorter, sorting_line, substances_networks
+from test_substances import COPPER, sorter, sorting_line, substances_networks
 
 from cirl_marl import (
     MPC,
@@ -75,7 +75,7 @@ def test_no_episode_leaves_the_ranges(network: Network, seed: int, is_drawn: boo
     """Whatever random actions do and draws bring, contents of stocks and flows lie in what limits are held against."""
     network = uncertain_network(network, seed) if is_drawn else network
     starts = content_limits._starts(network, factor_ranges(network, with_draws=True))
-    ranges = reachable_contents(network, starts, content_limits._shares(network))
+    ranges = reachable_contents(network, starts, content_limits._shares(network), set())
     env = MultiAgentVectorEnv(network, num_envs=4, uncertain=bool(network.uncertain))
     env.reset(seed=seed)
     rng, count, stores = np.random.default_rng(seed), len(network.substances), len(network.stores)
@@ -100,7 +100,7 @@ def test_shares_of_components_lead_to_contents_within_the_ranges(seed: int) -> N
     bounds = np.ones((2, 3, len(network.arcs)))
     rejects = network.arc_index["rejects"]
     bounds[:, :, rejects] = shares * rng.uniform(0.5, 1.0, 3), np.minimum(shares * rng.uniform(1.0, 2.0, 3), 1.0)
-    low, high = reachable_contents(network, starts, bounds)[1][:, :, rejects]
+    low, high = reachable_contents(network, starts, bounds, set())[1][:, :, rejects]
     exact = contents * shares / (contents @ shares)
     assert (low <= exact).all() and (exact <= high).all()
 
@@ -210,7 +210,7 @@ def test_loops_without_stock_purify_as_far_as_they_do(seed: int, mines: int, con
     """Contents of all flows lie in their ranges; of one mine they are these, and limits below them are refused."""
     network, rng = sorting_loop(seed, mines, controlled=controlled), np.random.default_rng(seed)
     starts = content_limits._starts(network, {})
-    low, high = (side[1] for side in reachable_contents(network, starts, content_limits._shares(network))[1])
+    low, high = (side[1] for side in reachable_contents(network, starts, content_limits._shares(network), set())[1])
     env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(seed=0)
     for _ in range(network.episode.horizon):
@@ -222,7 +222,7 @@ def test_loops_without_stock_purify_as_far_as_they_do(seed: int, mines: int, con
         arcs = [replace(arc, transfer={}, control=None) for arc in network.arcs]
         mixing = replace(network, nodes=tuple(nodes), arcs=tuple(arcs))
         starts, shares = content_limits._starts(mixing, {}), content_limits._shares(mixing)
-        assert (reachable_contents(mixing, starts, shares)[1][:, 1] == 0.1).all()
+        assert (reachable_contents(mixing, starts, shares, set())[1][:, 1] == 0.1).all()
     if mines > 1 or controlled:
         return
     np.testing.assert_allclose(low, content, rtol=0, atol=1e-8)
@@ -289,6 +289,45 @@ def test_loops_that_agents_or_draws_change_have_limits(seed: int, kind: str) -> 
     assert replace(network, services=(limit,))
     with pytest.raises(NetworkError, match="of what is in 'made' is copper, whatever is done"):
         replace(network, services=(replace(limit, high=0.999 * least),))
+
+
+@pytest.mark.parametrize("count", [10, 100, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("quantity", ["flow", "stock"])
+def test_loops_of_any_size_have_limits(count: int, quantity: str) -> None:
+    """Of copper P passes all sorters and of all else Q, b goes back: c·P·(1 − b)/(1 − P·b) is left, likewise of Q."""
+    kept, other, back, content = 0.2, 0.9, 0.3, 0.05
+    reject, share = 1.0 - kept ** (1 / count), 1.0 - other ** (1 / count)
+    control = Control(kind=ControlKind.TRANSFER, low=0.0, neutral=0.5 * reject, high=reject, substances=("copper",))
+    nodes = [Node(id="mine", initial=(9.0, 9.0), content={"copper": content})]
+    nodes += [Node(id=id_, initial=(0.0, 0.0), role=Role.LANDFILL) for id_ in ("use", "waste")]
+    nodes += [Node(id=f"sorter_{i}", stores=False) for i in range(count)]
+    arcs = [Arc(id="mined", donor="mine", recipient="sorter_0", rate=0.3)]
+    for i in range(count - 1):
+        set_by: dict[str, Any] = {"control": control} if i % 2 else {"transfer": {"copper": reject}}
+        ends: dict[str, Any] = {"donor": f"sorter_{i}", "law": Law.SHARE}
+        arcs.append(Arc(id=f"rejects_{i}", recipient="waste", share=share, **ends, **set_by))
+        arcs.append(Arc(id=f"on_{i}", recipient=f"sorter_{i + 1}", **ends))
+    ends = {"donor": f"sorter_{count - 1}", "law": Law.SHARE}
+    arcs.append(Arc(id="rejects", recipient="waste", share=share, transfer={"copper": reject}, **ends))
+    again = {"copper": back * (1.0 - reject)}
+    arcs.append(Arc(id="again", recipient="sorter_0", share=back * (1.0 - share), transfer=again, **ends))
+    arcs.append(Arc(id="made", recipient="use", **ends))
+    passed, rest = (c * p * (1 - back) / (1 - p * back) for c, p in ((content, kept), (1 - content, other)))
+    least = passed / (passed + rest)
+    provider = "made" if quantity == "flow" else "use"
+    limit = Service(id="pure", provider=provider, quantity=quantity, substance="copper", high=least * (1 + 1e-6))
+    parts: dict[str, Any] = {
+        "nodes": tuple(nodes),
+        "arcs": tuple(arcs),
+        "substances": COPPER,
+        "episode": Episode(horizon=1),
+    }
+    network = Network(name="ring", services=(limit,), **parts)
+    with pytest.raises(NetworkError, match="is copper, whatever is done"):
+        replace(network, services=(replace(limit, high=least * (1 - 1e-6)),))
+    env = MultiAgentVectorEnv(network, num_envs=1)
+    env.reset(seed=0)
+    assert env.advance(np.ones((len(env.actuators.control_rows), 1))).levels[0, 0] == pytest.approx(1.0, abs=1e-9)
 
 
 def test_limits_and_contents_that_change_are_those_of_some_time() -> None:

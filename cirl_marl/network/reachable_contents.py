@@ -7,6 +7,7 @@ from typing import Any
 import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from cirl_marl.network.rowsum import Floats, Integers
 from cirl_marl.network.substances import changing_sources, separates
@@ -16,18 +17,19 @@ SETTLED, ROUNDS = 1e-12, 1000
 ROUND_OFF = 1e-9
 """By how much sums may round."""
 MANY, POLICIES = 64, 100
-"""Nodes of the largest loop whose visits are looked for, and policies that are tried; a handful is enough."""
+"""Nodes of loops whose visits are all looked for, and policies that are tried; a handful is enough."""
 
 Ways = tuple[Integers, Integers, Floats]
 """Arcs that enter loops, nodes that they lead past, and how often."""
 
 
-def reachable_contents(network: Any, starts: Floats, shares: Floats) -> tuple[Floats, Floats]:
+def reachable_contents(network: Any, starts: Floats, shares: Floats, subjects: set[int]) -> tuple[Floats, Floats]:
     """Return what part of each stock and of each flow each component may be at any time.
 
     Stocks begin with their content and mix what enters; what a node hands on in shares that differ by component has
     s_c·x_c of Σ s·x. The ranges are the least that contain ``starts`` and reproduce themselves. Where material goes
-    round past nodes without stock, s_c may also be how often it passes a node in all; what both allow is left.
+    round past nodes without stock, s_c may also be how often it passes a node in all; what both allow is left. In loops
+    of many nodes that is looked for where it matters to ``subjects``.
 
     Args:
         network: whose nodes mix and separate.
@@ -35,6 +37,7 @@ def reachable_contents(network: Any, starts: Floats, shares: Floats) -> tuple[Fl
             components, stores); from 1 to 0 where there is nothing.
         shares: least and greatest share of each arc of law ``share``, 1 of others, by component, of any interval, shape
             (2, components, arcs).
+        subjects: nodes of which, or of whose flows, contents are looked for.
 
     Returns:
         Least and greatest part, shapes (2, components, stores) and (2, components, arcs); from 1 to 0 of what there
@@ -45,7 +48,7 @@ def reachable_contents(network: Any, starts: Floats, shares: Floats) -> tuple[Fl
         is_separate[[*split.controlled_arcs, *split.other_arcs]] = separates(network, split)
     no_ways = np.empty(0, np.intp), np.empty(0, np.intp), shares[:, :, :0]
     ranges = _settled_ranges(network, starts, shares, is_separate, no_ways)
-    ways = _loop_visits(network, shares, is_separate)
+    ways = _loop_visits(network, shares, is_separate, subjects)
     if len(ways[0]):
         with_visits = _settled_ranges(network, starts, shares, is_separate, ways)
         ranges = np.stack([np.maximum(ranges[0], with_visits[0]), np.minimum(ranges[1], with_visits[1])])
@@ -80,10 +83,11 @@ def _settled_ranges(network: Any, starts: Floats, shares: Floats, is_separate: N
     return within
 
 
-def _loop_visits(network: Any, shares: Floats, is_separate: NDArray[np.bool_]) -> Ways:
-    """Return how often each component of what enters a loop of nodes without stock passes each of its nodes.
+def _loop_visits(network: Any, shares: Floats, is_separate: NDArray[np.bool_], subjects: set[int]) -> Ways:
+    """Return how often each component of what enters a loop of nodes without stock passes its nodes.
 
-    Only loops that separate are among them, of at most ``MANY`` nodes, past which nothing can go round for ever.
+    Only loops that separate are among them, past which nothing can go round for ever. Of more than ``MANY`` nodes those
+    are looked at that are subjects, or from which what leaves the loop may come to one.
 
     Returns:
         Arcs that enter, and nodes that are passed, shape (ways,) each, and least and most visits, shape (2, components,
@@ -92,16 +96,25 @@ def _loop_visits(network: Any, shares: Floats, is_separate: NDArray[np.bool_]) -
     stores = len(network.stores)
     is_within = (network.donors >= stores) & (network.recipients >= stores)
     graph = nx.DiGraph(zip(network.donors[is_within].tolist(), network.recipients[is_within].tolist(), strict=True))
+    whole = network_digraph(network)
+    upstream = [*subjects.union(*(nx.ancestors(whole, node) for node in subjects))]
     ways: list[Ways] = [(np.empty(0, np.intp), np.empty(0, np.intp), shares[:, :, :0])]
     for loop in nx.strongly_connected_components(graph):
         nodes = np.array(sorted(loop), dtype=np.intp)
         leaves, comes = np.isin(network.donors, nodes), np.isin(network.recipients, nodes)
-        if len(nodes) > MANY or not is_separate[leaves & comes].any():
+        if not is_separate[leaves & comes].any():
             continue  # to mix what has one content is exact
+        outlets = nodes
+        if len(nodes) > MANY:
+            is_way_out = leaves & ~comes & np.isin(network.recipients, upstream)
+            outlets = np.union1d(network.donors[is_way_out], [*subjects & loop]).astype(np.intp)
+        if not len(outlets):
+            continue
         givers = np.searchsorted(nodes, network.donors[leaves])
         getters = np.where(comes, np.searchsorted(nodes, network.recipients), len(nodes))[leaves]
+        targets = np.searchsorted(nodes, outlets)
         visits = [
-            [_visits(part[:, leaves], givers, getters, len(nodes), side) for part in shares.swapaxes(0, 1)]
+            [_visits(part[:, leaves], givers, getters, len(nodes), targets, side) for part in shares.swapaxes(0, 1)]
             for side in (-1, 1)
         ]
         if not np.isfinite(visits).all():
@@ -109,13 +122,20 @@ def _loop_visits(network: Any, shares: Floats, is_separate: NDArray[np.bool_]) -
         arcs = np.flatnonzero(comes & ~leaves)
         starts = np.searchsorted(nodes, network.recipients[arcs])
         totals = np.array(visits)[:, :, starts].reshape(2, len(shares[0]), -1)
-        ways.append((arcs.repeat(len(nodes)), np.tile(nodes, len(arcs)), totals))
+        ways.append((arcs.repeat(len(outlets)), np.tile(outlets, len(arcs)), totals))
     arcs, ends, totals = (np.concatenate(parts, axis=-1) for parts in zip(*ways, strict=True))
     return arcs, ends, totals
 
 
-def _visits(shares: Floats, givers: Integers, getters: Integers, count: int, side: int) -> Floats:
-    """Return the least (``side`` −1) or most (1) visits of each node, of what enters each, shape (entries, nodes).
+def network_digraph(network: Any) -> Any:
+    """Return the nodes, by their numbers, and which of them can give to which."""
+    graph = nx.DiGraph(zip(network.donors.tolist(), network.recipients.tolist(), strict=True))
+    graph.add_nodes_from(range(len(network.nodes)))
+    return graph
+
+
+def _visits(shares: Floats, givers: Integers, getters: Integers, count: int, targets: Integers, side: int) -> Floats:
+    """Return the least (``side`` −1) or most (1) visits of targets, of what enters each node, (entries, targets).
 
     They are the values of a Markov decision process, one for each node that is visited, found by policy iteration.
 
@@ -124,35 +144,59 @@ def _visits(shares: Floats, givers: Integers, getters: Integers, count: int, sid
         givers: the nodes that they leave, shape (arcs,).
         getters: those that they enter, ``count`` for others.
         count: number of nodes.
+        targets: the nodes that are visited.
         side: which visits.
 
     References: Howard 1960.
     """
-    (least, most), target, endless = shares, np.eye(count), np.full((count, count), np.inf)
-    remainder, values = np.ones(count), np.zeros((count, count + 1))
+    (least, most), endless = shares, np.full((count, len(targets)), np.inf)
+    remainder, values = np.ones(count), np.zeros((len(targets), count + 1))
     np.subtract.at(remainder, givers, least)
     sorted_givers = np.sort(givers)
-    first, places = np.searchsorted(sorted_givers, sorted_givers), np.arange(count)[:, None]
+    first, policy = np.searchsorted(sorted_givers, sorted_givers), np.full((len(targets), len(givers)), -1.0)
+    rows = np.arange(len(targets))  # whose policies have not settled
     for _ in range(POLICIES):
         # each node's shares get their room in the order of what they bring: a fractional knapsack
-        order = np.lexsort((-side * values[:, getters], np.tile(givers, (count, 1))))
+        order = np.lexsort((-side * values[rows][:, getters], np.tile(givers, (len(rows), 1))))
         room = (most - least)[order]
         before = np.cumsum(room, axis=1) - room
         before -= before[:, first]
         parts = least[order] + (remainder[sorted_givers] - before).clip(0.0, room)
-        policy = np.zeros((count, count, count + 1))
-        np.add.at(policy, (places, sorted_givers, getters[order]), parts)
+        better = np.empty_like(parts)
+        np.put_along_axis(better, order, parts, axis=1)
+        is_other = (better != policy[rows]).any(axis=1)
+        rows = rows[is_other]
+        if not len(rows):
+            return values[:, :count].T.clip(0.0)
+        policy[rows] = better[is_other]
         try:
-            better = np.linalg.solve(target - policy[..., :count], target[..., None])[..., 0]
-        except np.linalg.LinAlgError:
+            visits = _values_of(policy[rows], targets[rows], givers, getters, count)
+        except RuntimeError:  # singular: what goes round for ever
             return endless
-        if better.min() < -ROUND_OFF:
+        if visits.min() < -ROUND_OFF:
             return endless
-        change = abs(better - values[:, :count]).max()
-        values[:, :count] = better
-        if change <= SETTLED * better.max():
-            return better.T.clip(0.0)
+        change = np.abs(visits - values[rows, :count]).max(axis=1)
+        values[rows, :count] = visits
+        rows = rows[change > SETTLED * visits.max(axis=1)]
     return endless
+
+
+def _values_of(policy: Floats, targets: Integers, givers: Integers, getters: Integers, count: int) -> Floats:
+    """Return how often mass that enters a node passes each target, by the target's policy, shape (targets, nodes).
+
+    Targets with the same shares, (targets, arcs), have one factorization.
+    """
+    from scipy.sparse.linalg import splu
+
+    values, within = np.empty((len(targets), count)), getters < count
+    groups: dict[bytes, list[int]] = {}
+    for row, shares in enumerate(policy):
+        groups.setdefault(shares.tobytes(), []).append(row)
+    for rows in groups.values():
+        routing = (policy[rows[0], within], (givers[within], getters[within]))
+        left = sparse.eye_array(count, format="csc") - sparse.csc_array(routing, shape=(count, count))
+        values[rows] = splu(left).solve(np.eye(count)[:, targets[rows]]).T
+    return values
 
 
 def _handed_on(content: Floats, shares: Floats, is_separate: NDArray[np.bool_]) -> Floats:

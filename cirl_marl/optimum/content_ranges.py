@@ -72,7 +72,7 @@ def content_ranges(network: Network, shares: Floats, present: Floats | None = No
         starts[:, :, i] = parts.min(axis=1), parts.max(axis=1)
     if present is not None:
         starts = np.stack([np.minimum(starts[0], present[0]), np.maximum(starts[1], present[1])])
-    stocks, flows = reachable_contents(network, starts, shares)
+    stocks, flows = reachable_contents(network, starts, shares, set())
     return flows, stocks
 
 

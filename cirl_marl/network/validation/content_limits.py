@@ -6,13 +6,14 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+import networkx as nx
 import numpy as np
 
 from cirl_marl.network.elements import Service
 from cirl_marl.network.initial_ages import content_edges
-from cirl_marl.network.reachable_contents import reachable_contents
+from cirl_marl.network.reachable_contents import network_digraph, reachable_contents
 from cirl_marl.network.rowsum import Floats
-from cirl_marl.network.series import means
+from cirl_marl.network.series import extremes, means
 from cirl_marl.network.split_fractions import share_ranges, splits
 from cirl_marl.network.substances import CONTENT, network_of_substance
 from cirl_marl.network.uncertainty import CERTAIN, factor_ranges
@@ -28,8 +29,9 @@ def limit_problems(network: Any) -> Iterator[str]:
     if not any(service.substance for service in network.services):
         return
     factors = factor_ranges(network, with_draws=True)
-    stocks, flows = reachable_contents(network, _starts(network, factors), _shares(network))
-    names = [substance.id for substance in network.substances]
+    starts, names = _starts(network, factors), [substance.id for substance in network.substances]
+    subjects = {node for service in network.services for node in _doubtful_nodes(network, service, names, starts)}
+    stocks, flows = reachable_contents(network, starts, _shares(network), subjects)
     for service in network.services:
         if not service.substance:
             continue
@@ -44,6 +46,21 @@ def limit_problems(network: Any) -> Iterator[str]:
             grade = float((network.interval_means(service.low) * ends[0]).max())
             limit = float((network.interval_means(service.high) * ends[1]).min())
             yield from _service_problems(service, grade, limit, least, most)
+
+
+def _doubtful_nodes(network: Any, service: Service, names: list[str], starts: Floats) -> set[int]:
+    """Return the nodes that a service is of, none if what they come from has the least and the most that is asked."""
+    if not service.substance:
+        return set()
+    if service.quantity == "stock":
+        subjects = {network.node_index[id_] for id_ in service.providers}
+    else:
+        subjects = set(network.donors[network.service_arcs(service)].tolist())
+    graph, row = network_digraph(network), 1 + names.index(service.substance)
+    origins = subjects.union(*(nx.ancestors(graph, node) for node in subjects)) & set(range(len(network.stores)))
+    least, most = starts[0, row, [*origins]].min(initial=1.0), starts[1, row, [*origins]].max(initial=0.0)
+    is_sure = least == 0.0 and (most == 1.0 or extremes(service.low)[1] == 0.0)
+    return set() if is_sure else subjects
 
 
 def _service_problems(service: Service, grade: float, limit: float, least: float, most: float) -> Iterator[str]:
