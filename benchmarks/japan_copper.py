@@ -87,8 +87,8 @@ def copper() -> Iterator[str]:
             yield f"| {products:g} % | {bears:g} % | {removed:.0f} kt | {' | '.join(changes)} |"
     yield ""
     yield "λ̄ in Mt/a, against a plan without limits. By column plans are at most"
-    yield f"{', '.join(f'{100 * off:.0f}' for off in np.max(gaps, axis=0))} % from their bounds; "
-    yield f"no service is below {min(services):.3f}."
+    largest = ", ".join(f"{100 * off:.0f}" for off in np.max(gaps, axis=0))
+    yield f"{largest} % from their bounds; no service is below {min(services):.3f}."
 
 
 def world() -> Iterator[str]:
