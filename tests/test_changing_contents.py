@@ -482,7 +482,10 @@ def changed(**changes: Any) -> Network:
 @pytest.mark.parametrize(
     ("mistake", "message"),
     [
-        (lambda: mine(copper=Series(times=(0.0,), values=(1.2,)), tin=0.0), "content.copper 1.2 must lie in [0, 1]"),
+        (
+            lambda: mine(copper=Series(times=(0.0, 2.0), values=(0.2, 1.2)), tin=0.0),
+            "content.copper 1.2 must lie in [0, 1], at time 2 of",
+        ),
         (lambda: mine(copper=Series(times=(1.0,), values=(0.2,))), "content.copper: series begins at 1"),
         (lambda: mine(tin=Series(times=(0.0, 3.0), values=(0.8, 0.95))), "its substances sum to 1.05 of its mass"),
         (

@@ -242,7 +242,9 @@ def test_contents_of_initial_stocks_are_drawn() -> None:
 def test_contents_that_no_stock_can_have_are_not_drawn() -> None:
     """Nor is it disturbed in time what is in a stock that others enter, or what a history was."""
     network, path = load_network(EXAMPLE), "nodes.wires.content.copper"
-    with pytest.raises(NetworkError, match=r"some draws of its contents sum to 1\.5, more than 1: give lower 'high'"):
+    with pytest.raises(
+        NetworkError, match=r"some draws of its contents sum to 1\.5, more than 1: end its range, or 'high', lower"
+    ):
         replace(network, uncertain={path: Spread(low=0.5, high=1.5, distribution="uniform")})
     ups = AutoRegression(mean=1.0, deviation=0.1, persistence=0.5, low=0.5, high=1.5)
     disturbed = {"nodes.scrap.content.copper": DisturbanceEffect(by="ups")}

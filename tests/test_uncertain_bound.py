@@ -725,7 +725,7 @@ def test_hidden_numbers_are_told() -> None:
         (works(3), {"uncertain": Sampling(directory=4)}, "directory must be a path, got 4"),  # type: ignore[arg-type]
         (works(3), {"uncertain": Sampling(settings=5)}, "settings must be a mapping"),  # type: ignore[arg-type]
         (works(3), {"uncertain": Sampling(draws=600_000)}, "draws 600000: at most 500,000"),
-        (works(3), {"uncertain": True, "min_service": "x"}, r"min_service 'x' must lie in \[0, 1\]"),
+        (works(3), {"uncertain": True, "min_service": "x"}, r"min_service 'x' must lie in \[0, 1\], a number for all"),
         (works(3), {"uncertain": Sampling(on="slurm")}, "needs a directory"),
         (works(3), {"uncertain": Sampling(on="nowhere")}, "nowhere"),
         (load_network("copper_net"), {"uncertain": True}, "nothing disturbs it"),

@@ -86,6 +86,10 @@ class TimeDependent:
         """Lowest and highest value."""
         raise NotImplementedError
 
+    def time_of(self, extreme: float) -> float:
+        """Return when it first has its lowest or highest value."""
+        raise NotImplementedError
+
 
 class Scalable:
     """What may stand for a rate on an account, with a ``factor``: the number of it that may change or be uncertain."""
@@ -339,7 +343,12 @@ def bound_problems(part_: Any, prefix: str = "") -> Iterator[str]:
         elif isinstance(declaration, Quantity) and value is not None:
             for number in value.extremes if isinstance(value, TimeDependent) else (value,):
                 if fault := declaration.bound_problem(number):
-                    yield f"{prefix}{name} {float(f'{number:.12g}')} {fault}"
+                    when = (
+                        f", at time {value.time_of(number):g} of the episode"
+                        if isinstance(value, TimeDependent)
+                        else ""
+                    )
+                    yield f"{prefix}{name} {float(f'{number:.12g}')} {fault}{when}"
                     break
 
 

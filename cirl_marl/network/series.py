@@ -57,6 +57,10 @@ class Series(CheckedRecord, TimeDependent):
         corners = [end * bound for end in (low, high) for bound in self.factor.extremes]
         return min(corners), max(corners)
 
+    def time_of(self, extreme: float) -> float:
+        """Return when it first comes closest to a value, as it does to its ``extremes``."""
+        return min(self.times, key=lambda time: abs(float(self.limits(np.array([time]), "right")[0]) - extreme))
+
     def __format__(self, spec: str) -> str:
         """Say its lowest and its highest value."""
         low, high = self.extremes

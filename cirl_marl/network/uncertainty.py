@@ -241,7 +241,7 @@ def _no_content(network: Specification, node: Node, path: str) -> str:
     by = f"disturbed by '{network.disturbed[path].by}': " if path in network.disturbed else ""
     if most <= 1 + ROUNDING:
         return ""
-    return f"{by}some draws of its contents sum to {most:.4g}, more than 1: give lower 'high'"
+    return f"{by}some draws of its contents sum to {most:.4g}, more than 1: end its range, or 'high', lower"
 
 
 def _lost_capacity(network: Specification, part: Any, path: str) -> str:

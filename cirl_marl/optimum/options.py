@@ -88,8 +88,10 @@ def check_service(min_service: ArrayLike) -> None:
         CirlError: naming the first of them.
     """
     for level in np.ravel(min_service).tolist():
-        if not isinstance(level, int | float) or not 0 <= level <= 1:
-            raise CirlError(f"min_service {level!r} must lie in [0, 1]")
+        is_number = isinstance(level, int | float)
+        if not is_number or not 0 <= level <= 1:
+            form = "" if is_number else ", a number for all services or a list with one for each"
+            raise CirlError(f"min_service {level!r} must lie in [0, 1]{form}")
 
 
 def demanded_levels(network: Network, min_service: ArrayLike, episodes: tuple[int, ...] = ()) -> Floats:
