@@ -15,7 +15,7 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 from small_networks import mill
-from test_substances import COPPER, EXAMPLE, sorter, substances_networks
+from test_substances import COPPER, EXAMPLE, TIN, sorter, substances_networks
 
 from cirl_marl import (
     MPC,
@@ -651,3 +651,43 @@ def test_levels_of_contents_in_a_step_are_those_of_the_episode_to_first_order(ba
             actions[0, k] = size
             change = simulate_plan(replace(plan, actions=actions)).levels[0, 1, 0] - level[0]
             assert change == pytest.approx(-table[k] * size / of_level, rel=1e-3) and change != 0
+
+
+def test_a_limit_out_of_reach_leaves_the_others() -> None:
+    """Scrap has 4 % tin, of which nothing is removed; that copper is leaves less of the product, and so more tin in it.
+
+    Steps that win a little tin by leaving copper are worth it where the price of what is short has risen.
+    """
+    sorting = Control(kind=ControlKind.TRANSFER, low=0.0, neutral=0.5, high=0.9, substances=("copper",))
+    content = {"copper": 0.02, "tin": 0.04}
+    nodes = (
+        Node(id="ore", role=Role.NONRENEWABLE_RESERVOIR, initial=(500.0, 500.0)),
+        Node(id="scrap", initial=(100.0, 100.0), content=content),
+        *(Node(id=id_, stores=False) for id_ in ("shredder", "melt")),
+        Node(id="use", initial=(50.0, 50.0), rate=0.1),
+        Node(id="waste", role=Role.LANDFILL, initial=(0.0, 0.0)),
+    )
+    arcs = (
+        Arc(id="mined", donor="ore", recipient="melt", law=Law.EXOGENOUS, flow=5.0),
+        Arc(id="scrapped", donor="scrap", recipient="shredder", law=Law.EXOGENOUS, flow=5.0),
+        Arc(id="rejects", donor="shredder", recipient="waste", law=Law.SHARE, share=0.1, control=sorting),
+        Arc(id="recovered", donor="shredder", recipient="melt", law=Law.SHARE),
+        Arc(id="made", donor="melt", recipient="use", law=Law.SHARE),
+        Arc(id="left", donor="use", recipient="waste", law=Law.SHARE),
+    )
+    limits = [
+        Service(id=id_, provider="made", quantity="flow", substance=id_, high=high)
+        for id_, high in (("copper", 0.002), ("tin", 0.01))
+    ]
+    network = Network(
+        name="two_limits",
+        nodes=nodes,
+        arcs=arcs,
+        services=tuple(limits),
+        substances=(*COPPER, TIN),
+        episode=Episode(horizon=1),
+    )
+    start = bound(network, min_service=[0.5, 0.0])
+    plan = improve_plan(replace(start, min_service=np.ones(2)), starts=1)
+    levels = simulate_plan(plan).episode_levels[0]
+    assert levels[0] == pytest.approx(1.0, abs=1e-4) and levels[1] < 0.6

@@ -20,7 +20,7 @@ from cirl_marl.network.elements import CIRCULARITY
 from cirl_marl.optimum.aims import Aim, budget_texts
 from cirl_marl.optimum.bounds import Bound, gap
 from cirl_marl.optimum.open_loop import Optimum
-from cirl_marl.optimum.options import levels_text
+from cirl_marl.optimum.options import lack_texts, levels_text
 from cirl_marl.optimum.registry import CONTROLLERS, named_controller
 
 
@@ -98,8 +98,9 @@ def _proof(controller: Controller, table: Schedule) -> str:
         dearest = max(names, key=prices.__getitem__)
         worth = f"{prices[dearest]:.4g} {unit}".rstrip() + (f" of {dearest}, no more in others" if names[1:] else "")
         demand += f", {text} (one more is worth {worth})"
-    share = float(gap(limit, aims.value(run)))
-    return f"bound with {demand}: {aims.statement(network, limit, 5)}, gap {share:.2%}"
+    proof = f"bound with {demand}: {aims.statement(network, limit, 5)}, gap {float(gap(limit, aims.value(run))):.2%}"
+    faults = [] if solution.min_service is None else lack_texts(network, solution.min_service, run.episode_levels[0])
+    return f"{proof}; no plan was found that keeps services; this one has {', '.join(faults)}" if faults else proof
 
 
 def _environment_and_controller(

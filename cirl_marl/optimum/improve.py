@@ -102,7 +102,8 @@ def improve_plan(
     if starts == 1:
         return plans[0]
     runs, price = [simulate_plan(plan) for plan in plans], prices(bound)
-    ranks = [(-max(shortage(bound, run), TOLERATED_SHORTFALL), penalised_objective(bound, run, price)) for run in runs]
+    shortages = [_total_shortage(trials.demand, bound.aims, run) for run in runs]
+    ranks = [(-short, penalised_objective(bound, run, price)) for short, run in zip(shortages, runs, strict=True)]
     return plans[ranks.index(max(ranks))]
 
 
@@ -165,7 +166,7 @@ def climb(
     value, trust, slopes = trials.value(run, price), TRUST, None
     has_contents, is_leap = any(service.substance for service in plan.network.services), False
     is_cheap = has_contents or bool(aims.budgets)
-    nearest, nearest_shortfall = plan, max(_shortage(demand, aims, run), TOLERATED_SHORTFALL)
+    nearest, nearest_shortfall = plan, _total_shortage(demand, aims, run)
     shortfall = nearest_shortfall
     for done in range(EXTENSION * rounds if is_cheap else rounds):
         is_short = np.append(demand - run.episode_levels[0], aims.excess(run) / aims.sizes) > TOLERATED_SHORTFALL
@@ -192,7 +193,7 @@ def climb(
             best, run = step.plan, step.run
             lack = np.maximum(demand - run.episode_levels[0], 0.0)  # a step lacks about what the last one did
             excess = aims.excess(run)
-            shortfall = max(_shortage(demand, aims, run), TOLERATED_SHORTFALL)
+            shortfall = _total_shortage(demand, aims, run)
             if shortfall <= nearest_shortfall:  # at other prices less may be kept later
                 nearest, nearest_shortfall = best, shortfall
             value, slopes = value + step.gain, None
@@ -202,7 +203,7 @@ def climb(
         else:
             trust = 0.0 if is_leap or not any(steps) else trust / 4
     progress(1.0)
-    return (nearest if aims.budgets and shortfall > nearest_shortfall else best), price
+    return (nearest if is_cheap and shortfall > nearest_shortfall else best), price
 
 
 @positional_record
@@ -281,9 +282,20 @@ def shortage(bound: Bound, run: Rollout) -> float:
 
 
 def _shortage(demand: Floats, aims: Aims, run: Any) -> float:
+    return float(_shortages(demand, aims, run).max(initial=0.0))
+
+
+def _total_shortage(demand: Floats, aims: Aims, run: Any) -> float:
+    """Return the sum of what is short, but for what is tolerated: as one is out of reach others may still be kept."""
+    shortages = _shortages(demand, aims, run)
+    return float(shortages[shortages > TOLERATED_SHORTFALL].sum())
+
+
+def _shortages(demand: Floats, aims: Aims, run: Any) -> Floats:
+    """Return what an episode is short of each demand and, relative to it, of each budget."""
     excess, limits = aims.excess(run), np.abs(aims.limits)
     relative_excess = np.divide(excess, limits, out=np.where(excess > 0, np.inf, 0.0), where=limits > 0)
-    return float(max((demand - run.episode_levels[0]).max(initial=0.0), relative_excess.max(initial=0.0)))
+    return np.concatenate([demand - run.episode_levels[0], relative_excess])
 
 
 def demand(bound: Bound) -> Floats:

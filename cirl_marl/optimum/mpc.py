@@ -39,7 +39,14 @@ from cirl_marl.optimum.bounds import out_of_reach
 from cirl_marl.optimum.draws import Prices
 from cirl_marl.optimum.futures import DrawnFutures
 from cirl_marl.optimum.improve import start_count, starting_actions
-from cirl_marl.optimum.options import check_margin, check_options, demanded_levels, starting_stocks, with_margin
+from cirl_marl.optimum.options import (
+    check_margin,
+    check_options,
+    demanded_levels,
+    lack_texts,
+    starting_stocks,
+    with_margin,
+)
 from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.slopes import MOST_SLOPES, slopes_of
 from cirl_marl.optimum.solver import Infeasible, SolverFailure
@@ -289,8 +296,7 @@ class MPC(Planner):
         pairs = zip(self._aims.budgets, excess.tolist(), strict=True)
         faults = [f"{part:.2%} more {budget.name}" for budget, part in pairs if part > NOTABLE]
         if plan.task.demand is not None:
-            lacks = zip(network.services, (plan.task.demand - plan.level).tolist(), strict=True)
-            faults += [f"{lack:.4f} less of '{service.id}'" for service, lack in lacks if lack > NOTABLE]
+            faults += lack_texts(network, plan.task.demand, plan.level)
         if faults:
             demands = "services and budgets" if self._aims.budgets else "services"
             self.note = f"no plan was found that keeps {demands}; this one has {', '.join(faults)}"

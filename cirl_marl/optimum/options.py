@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cirl_marl.controllers.outcome import NOTABLE
 from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.errors import CirlError, unknown_name, whole_number
 from cirl_marl.network import Floats, Network
@@ -114,6 +115,12 @@ def levels_text(network: Network, levels: Floats) -> str:
     if len(set(levels.tolist())) == 1:
         return f"{levels[0]:g}"
     return ", ".join(f"{level:g} of '{service.id}'" for level, service in zip(levels, network.services, strict=True))
+
+
+def lack_texts(network: Network, demand: Floats, levels: Floats) -> list[str]:
+    """Say of which services levels are notably less than is demanded, shape (services,) each."""
+    lacks = zip(network.services, (demand - levels).tolist(), strict=True)
+    return [f"{lack:.4f} less of '{service.id}'" for service, lack in lacks if lack > NOTABLE]
 
 
 def check_margin(margin: float, name: str = "margin") -> None:
