@@ -454,6 +454,11 @@ def test_more_than_the_flow_is_brought_within_it(tmp_path: Path) -> None:
         ),
         ([*sorting(), sorting()[3]], {}, "line 8: Copper of 'Mine' to 'Sorter' in 2000 stands in line 5 too"),
         (
+            sorting((4, 130, 3), unit="%"),
+            {"reconcile": True},
+            "'Sorter' to 'Product' in 2000: 130 % is more than there is",
+        ),
+        (
             sorting(unit="GJ"),
             {},
             "line 5: unit 'GJ'.*of a substance give a part, as in % or ppm, or an amount in kt/year",

@@ -96,6 +96,9 @@ class SubstanceRows:
             except CirlError as error:
                 faults.append(f"{sheet}, line {line}: {error}")
                 continue
+            if is_part and value * scale > 1 + EXACT:
+                faults.append(f"{subject}: {value:g} {text or stated_unit} is more than there is; check its unit")
+                continue
             scale *= flow if is_part else 1.0
             amounts[place], deviations[place] = value * scale, deviation * scale
             is_content[place], lines[place] = is_part, line
