@@ -37,6 +37,7 @@ from cirl_marl.controllers.rollout import rollout
 from cirl_marl.definitions.reader import write_network
 from cirl_marl.dynamics import supply
 from cirl_marl.dynamics.complementarity import complementary
+from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.network import Network
 from cirl_marl.network.elements import Lifetime
 from cirl_marl.optimum import bound, improve_plan, simulate_plan
@@ -752,3 +753,32 @@ def test_what_cannot_make_up_is_refused(
         network = town(weights)
         arcs = tuple(replace(arc, **changed.get(arc.id, {})) for arc in network.arcs)
         replace(network, arcs=arcs)
+
+
+@pytest.mark.parametrize("name", ["solids_net", "net_zero", "paper_city", "cycle"])
+def test_blocks_of_copies_are_the_whole(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Copies that do not fit a cache together go through an interval block by block, to the same bits."""
+
+    def episode() -> tuple[Floats, ...]:
+        env = MultiAgentVectorEnv(cycle() if name == "cycle" else load_network(name), num_envs=5)
+        rng, arrays = np.random.default_rng(2), list[Floats]()
+        env.reset(seed=1)
+        entries = len(env.actuators.control_rows)
+        for _ in range(4):
+            env.advance(rng.uniform(-1, 1, (entries, 5)))
+            physical = env.physical
+            arrays += [physical.stock, physical.inner, physical.flow, physical.batched]
+        return tuple(arrays)
+
+    whole, shapes = episode(), list[int]()
+    advance = Dynamics.advance
+
+    def seen(self: Dynamics, stock: Any, *others: Any) -> Any:
+        shapes.append(stock.shape[1])
+        return advance(self, stock, *others)
+
+    monkeypatch.setattr(Dynamics, "advance", seen)
+    monkeypatch.setattr(supply, "CELLS", 1)
+    for parts, array in zip(episode(), whole, strict=True):
+        np.testing.assert_array_equal(parts, array)
+    assert set(shapes) == {1}

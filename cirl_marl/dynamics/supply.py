@@ -154,15 +154,19 @@ class Supply:
         Returns:
             the controls with what the arcs supply, and what the interval did.
         """
-        if not idle.any():
-            return controls, self._dynamics.advance(stock, inner, controls, step, factors)
-        batch, idle = controls.shape[1], np.broadcast_to(idle, (len(self.arcs), controls.shape[1]))
+        batch, is_idle = controls.shape[1], bool(idle.any())
         block = max(1, CELLS // self._dynamics.rows.masses)
-        parts = []
+        if not is_idle and batch <= block:
+            return controls, self._dynamics.advance(stock, inner, controls, step, factors)
+        idle, parts = np.broadcast_to(idle, (len(self.arcs), batch)), []
         for columns in (slice(first, first + block) for first in range(0, batch, block)):
             masses, states, others = (np.ascontiguousarray(array[:, columns]) for array in (stock, inner, controls))
             draws = None if factors is None else np.ascontiguousarray(factors[:, columns])
-            parts.append(self._advance_block(masses, states, others, step[columns], idle[:, columns], draws))
+            inputs = masses, states, others, step[columns]
+            if is_idle:
+                parts.append(self._advance_block(*inputs, idle[:, columns], draws))
+            else:
+                parts.append((others, self._dynamics.advance(*inputs, draws)))
         if len(parts) == 1:
             return parts[0]
         arrays = zip(*([getattr(done, field.name) for field in fields(done)] for _, done in parts), strict=True)
