@@ -46,10 +46,9 @@ from cirl_marl import (
     Series,
     Service,
 )
-from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.errors import unknown_name
 from cirl_marl.network.elements import Lifetime
-from cirl_marl.optimum import bound, improve_plan, simulate_plan
+from cirl_marl.optimum import close_gap
 
 WEEK = 1 / 52
 DURABLE = 4.0
@@ -59,15 +58,10 @@ LIMIT = 60.0
 """Seconds of processor time for each network."""
 STOPPED = 90
 """Seconds of processor time after which it is given up, in the middle of a program."""
-SERVICE, MISSED = 0.95, 1e-4
-"""Mean level demanded of each service, and how much of it a plan may miss."""
+SERVICE = 0.95
+"""Mean level demanded of each service."""
 GAP = 0.01
 """Of the bound, within which a plan counts as close."""
-DEGREES, TIGHT = (1, 2, 3, 4), 2
-"""Degrees of the test polynomials, tried in turn while there is time, and the highest with constant parts (``tight``).
-From degree 2 on the first bounds of seeds 62 and 199 of cycles with lifetimes left no time for a plan that serves."""
-ROUNDS, STALLED = 20, 5
-"""Most linear programs of an improvement, and after how many of them it has to have got closer."""
 
 
 @dataclass(frozen=True)
@@ -144,48 +138,22 @@ def planned(seed: int, family: Family = RATES) -> Outcome:
     begun = time.process_time()
     network = yearly_network(seed, family)
     size = len(network.nodes), network.episode.horizon
-    scale = network.objective.circularity_scale
-    best, proved, degree, reason, plan = -np.inf, np.inf, 0, "", None
-
-    def seconds() -> float:
-        return time.process_time() - begun
-
-    def enough(run: Rollout) -> bool:
-        """Remember an episode that keeps the services; say whether it is close, hardly better, or time is over."""
-        nonlocal best
-        if float(run.episode_levels.min(initial=1.0)) >= SERVICE - MISSED:
-            best = max(best, float(run.episode_circularity[0]))
-        reached.append(best)
-        earlier = reached[-STALLED] if len(reached) >= STALLED else -np.inf
-        stalled = np.isfinite(earlier) and best - earlier < 0.05 * GAP * abs(proved)
-        return best >= proved - GAP * abs(proved) or bool(stalled) or seconds() > LIMIT
-
-    for degree in DEGREES:
-        if degree > DEGREES[0] and seconds() > LIMIT / 2:  # the next bound takes longer than the last one did
-            break
-        try:
-            level = SERVICE if network.services else None
-            found = bound(network, min_service=level, degree=degree, tight=degree <= TIGHT)
-        except CirlError as missing:
-            reason = str(missing)
-            break
-        if found.verify().bound != found.objective:
-            reason = "the certificate does not prove the bound"
-            break
-        proved = min(proved, found.objective)
-        reached: list[float] = []
-        plan = improve_plan(found if plan is None else plan, rounds=ROUNDS, enough=enough)
-        enough(simulate_plan(plan))
-        if best >= proved - GAP * abs(proved):
-            break
-    gap = (proved - best) / abs(proved) if np.isfinite(best) else np.nan
-    if not reason and not np.isfinite(best):
+    level = SERVICE if network.services else None
+    try:
+        closing = close_gap(network, within=GAP, seconds=LIMIT, min_service=level)
+    except CirlError as missing:
+        return Outcome(seed, *size, seconds=time.process_time() - begun, reason=str(missing))
+    seconds, found, reason = time.process_time() - begun, closing.bound, ""
+    if found.verify().bound != found.objective:
+        reason = "the certificate does not prove the bound"
+    elif np.isnan(closing.gap):
         reason = "the plan misses services"
-    elif not reason and gap > GAP:
-        reason = f"a gap of {gap:.2%}"
-    elif not reason and seconds() > LIMIT:
-        reason = f"{seconds():.0f} s"
-    return Outcome(seed, *size, proved / scale, gap, degree, seconds(), reason)
+    elif closing.gap > GAP:
+        reason = f"a gap of {closing.gap:.2%}"
+    elif seconds > LIMIT:
+        reason = f"{seconds:.0f} s"
+    proved = found.objective / network.objective.circularity_scale
+    return Outcome(seed, *size, proved, closing.gap, found.degree, seconds, reason)
 
 
 def planned_apart(seed: int, family: Family) -> Outcome:

@@ -3,6 +3,7 @@
 from cirl_marl.optimum.admissible import NoCertificate
 from cirl_marl.optimum.bounds import Bound, Envelope, bound, envelope, gap
 from cirl_marl.optimum.certificate import Certificate, Verification
+from cirl_marl.optimum.closing import Closing, close_gap
 from cirl_marl.optimum.cross_entropy import Incumbent, search, search_each, standard_candidates
 from cirl_marl.optimum.draw_proofs import Sampling
 from cirl_marl.optimum.improve import improve_plan
@@ -13,6 +14,7 @@ from cirl_marl.optimum.uncertain_bound import UncertainBound
 __all__ = [
     "Bound",
     "Certificate",
+    "Closing",
     "Envelope",
     "Incumbent",
     "NoCertificate",
@@ -21,6 +23,7 @@ __all__ = [
     "UncertainBound",
     "Verification",
     "bound",
+    "close_gap",
     "envelope",
     "gap",
     "improve_plan",

@@ -69,6 +69,7 @@ def improve_plan(
     *,
     rounds: int = 20,
     starts: int | None = None,
+    least_gain: float = NO_PROMISE,
     enough: Callable[[Rollout], bool] = lambda run: False,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Bound:
@@ -85,6 +86,7 @@ def improve_plan(
         rounds: most linear programs to solve, from each start.
         starts: how many actions to begin from: those of the bound, then random ones, constant in time and always the
             same; None: 1, with services of contents CONTENT_STARTS, in small networks SMALL_STARTS.
+        least_gain: part of the objective that a step has to promise, or no more are made where nothing is short.
         enough: asked of each episode that is better than those before, whether to stop there.
         progress: called with the share of them that is solved; 1 when no more are needed.
     """
@@ -97,7 +99,8 @@ def improve_plan(
     plans: list[Bound] = []
     for start, actions in enumerate(starting_actions(bound.actions, starts)):
         report = partial(_tell, progress, start, starts)
-        plan, _ = climb(replace(bound, actions=actions), trials, prices(bound), rounds, enough, report)
+        first = replace(bound, actions=actions)
+        plan, _ = climb(first, trials, prices(bound), rounds, enough, report, least_gain=least_gain)
         plans.append(plan)
     if starts == 1:
         return plans[0]
@@ -146,6 +149,8 @@ def climb(
     rounds: int,
     enough: Callable[[Any], bool] = lambda run: False,
     progress: Callable[[float], None] = lambda share: None,
+    *,
+    least_gain: float = NO_PROMISE,
 ) -> tuple[P, Floats]:
     """Return a plan with better actions, by linear programs around episodes, from its own, and the last prices.
 
@@ -159,6 +164,7 @@ def climb(
             budgets while something is short.
         enough: asked of each episode that is better than those before, whether to stop there.
         progress: called with the share of rounds that are done.
+        least_gain: as in ``improve_plan``.
     """
     dynamics, demand, aims, price = Dynamics(plan.network), trials.demand, plan.aims, price.copy()
     lack, excess = np.zeros(len(demand)), np.zeros(len(aims.budgets))
@@ -186,7 +192,8 @@ def climb(
         for is_held in (False, True) if len(slopes.supplies.services) else (False,):
             around = best, dynamics, run, wanted, price, trust, slopes
             program = step_program(*around, limits=limits, span=trials.span, is_leap=is_leap, is_held=is_held)
-            steps.append(_corrected_step(program, best, run, trials, price, value))
+            least = abs(value) * (least_gain if shortfall <= TOLERATED_SHORTFALL else NO_PROMISE)
+            steps.append(_corrected_step(program, best, run, trials, price, value, least))
         progress(min((done + 1) / rounds, 1.0))
         step = max(filter(None, steps), key=lambda step: step.gain, default=_Step(best, run, 0.0))
         if step.gain > 0:
@@ -216,15 +223,15 @@ class _Step:
 
 
 def _corrected_step(
-    program: StepProgram, plan: P, run: Any, trials: Trials, price: Floats, value: float
+    program: StepProgram, plan: P, run: Any, trials: Trials, price: Floats, value: float, least: float
 ) -> _Step | None:
-    """Return the best of a step around a plan and of its corrections; None if the step promises nothing."""
+    """Return the best of a step around a plan and of its corrections; None if it promises no more than the least."""
     best, corrected = _Step(plan, run, 0.0), program
     for _ in range(1 + CORRECTIONS):
         values = best_values(corrected.problem, corrected.scale)
         if values is None:  # a smaller region is another program
             break
-        if corrected is program and program.promise(values) <= NO_PROMISE * abs(value):
+        if corrected is program and program.promise(values) <= least:
             return None
         candidate = _with_actions(plan, np.clip(plan.actions + values[program.columns.action], -1.0, 1.0))
         trial = trials.simulate(candidate)

@@ -1,0 +1,106 @@
+"""A bound and a plan within a gap of each other: cheap programs first, dearer ones while there is time.
+
+Programs of higher degree prove more and take longer, and whether the bound or the plan is what keeps them apart is only
+known once the plan gets no better. So the plan of the cheapest bound is improved until a step promises little of the
+gap; if the two are still apart, a tighter bound is proved, as long as it can be had in the time that is left.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Annotated, Any
+
+from numpy.typing import ArrayLike
+
+from cirl_marl.controllers.rollout import Rollout
+from cirl_marl.errors import CirlError
+from cirl_marl.network import Network
+from cirl_marl.network.declarations import frozen_record
+from cirl_marl.optimum.bounds import Bound, bound, gap
+from cirl_marl.optimum.improve import TOLERATED_SHORTFALL, improve_plan, shortage
+from cirl_marl.optimum.options import check_margin
+from cirl_marl.optimum.planned_episodes import simulate_plan
+
+DEGREES, TIGHT = (1, 2, 3, 4), 2
+"""Degrees of the test polynomials, in turn, and the highest with constant parts (``tight``), which take as long."""
+LONGER = 2.0
+"""Times as long as a bound takes that of the next degree: 1.6 (seed 62 of the cycles with lifetimes of
+``benchmarks.yearly``, degrees 1 and 2), as interior points take some 1.5 of twice the moments."""
+NEGLIGIBLE = 0.05
+"""Part of the gap that is asked for, which a step of a plan has to promise to be made."""
+
+
+@frozen_record
+class Closing:
+    """What came of it."""
+
+    bound: Annotated[Bound, "the lowest that was proved, with the actions of the best plan"]
+    run: Annotated[Rollout, "the episode of the plan in the simulator"]
+    gap: Annotated[float, "of the plan, relative to the bound; NaN if it is short of a service or over a budget"]
+    seconds: Annotated[float, "of processor time"]
+
+
+def close_gap(
+    network: str | Network,
+    *,
+    within: float = 0.01,
+    seconds: float = math.inf,
+    degrees: Sequence[int] = DEGREES,
+    min_service: ArrayLike | None = None,
+    **options: Any,
+) -> Closing:
+    """Return a plan and a bound that are ``within`` a gap of each other, or as near as they come in the time.
+
+    Args:
+        network: catalogue name, path of a definition file, or a network.
+        within: gap that is enough, relative to the bound.
+        seconds: of processor time in which to begin what takes long; the first bound, and a step, are seen through.
+        degrees: of the test polynomials, tried in turn.
+        min_service: see ``bound``.
+        options: others of ``bound``, but ``degree``, ``tight`` and ``service_weight``.
+
+    Raises:
+        CirlError: as ``bound`` of the first degree does.
+    """
+    check_margin(within, "within")
+    begun = time.process_time()
+
+    def used() -> float:
+        return time.process_time() - begun
+
+    proved: Bound | None = None
+    run: Rollout | None = None
+    for degree in degrees:
+        start = used()
+        try:
+            found = bound(network, min_service=min_service, degree=degree, tight=degree <= TIGHT, **options)
+        except CirlError:
+            if proved is None:
+                raise
+            break  # a solver that fails at a higher degree takes nothing back
+        took = used() - start
+        actions = found.actions if proved is None else proved.actions
+        if proved is None or found.objective < proved.objective:
+            proved = replace(found, actions=actions)
+
+        def is_enough(episode: Rollout, proved: Bound = proved) -> bool:
+            return _gap(proved, episode) <= within or used() > seconds
+
+        if run is None or math.isnan(_gap(proved, run)):
+            plan = improve_plan(found, least_gain=NEGLIGIBLE * within, enough=is_enough)
+            proved, run = replace(proved, actions=plan.actions), simulate_plan(plan)
+        if is_enough(run) or used() + LONGER * took > seconds:
+            break
+    if proved is None or run is None:
+        raise CirlError("degrees: give at least one")
+    return Closing(bound=proved, run=run, gap=_gap(proved, run), seconds=used())
+
+
+def _gap(proved: Bound, run: Rollout) -> float:
+    """Return the gap of an episode; NaN if it is short of what is demanded."""
+    if shortage(proved, run) > TOLERATED_SHORTFALL:
+        return math.nan
+    return float(gap(proved.objective, proved.aims.value(run)))

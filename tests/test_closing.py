@@ -1,0 +1,116 @@
+"""A plan and a bound within a gap of each other: which programs are solved for it, and when it stops."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cirl_marl import CirlError, load_network
+from cirl_marl.optimum import Bound, bound, close_gap, closing, improve, improve_plan, simulate_plan
+from cirl_marl.optimum.slopes import jacobians
+
+
+@pytest.fixture
+def degrees(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Return the degrees of the bounds that will have been solved for."""
+    tried = list[int]()
+
+    def seen(*network: Any, degree: int, **options: Any) -> Bound:
+        tried.append(degree)
+        solution: Bound = bound(*network, degree=degree, **options)
+        return solution
+
+    monkeypatch.setattr(closing, "bound", seen)
+    return tried
+
+
+SHORT = load_network("copper_net").with_options(episode={"horizon": 12})
+"""Its best plan is 4 % from the bound of degree 1, 0.5 % from that of degree 2."""
+EMPTYING = 1.0
+"""Action of everybody that leaves 75 % of the service."""
+
+
+@pytest.mark.parametrize(("within", "tried"), [(0.05, [1]), (0.01, [1, 2])])
+def test_as_many_programs_as_the_gap_asks_for(degrees: list[int], within: float, tried: list[int]) -> None:
+    """The plan is an episode that keeps the service, and the bound is the one of the last degree, with a proof."""
+    found = close_gap(SHORT, within=within, min_service=0.95)
+    assert degrees == tried
+    assert found.bound.objective == bound(SHORT, min_service=0.95, degree=tried[-1], tight=True).objective
+    assert found.bound.objective == found.bound.verify().bound
+    run = simulate_plan(found.bound)
+    assert run.episode_levels.min() >= 0.95 - improve.TOLERATED_SHORTFALL
+    assert 0.0 <= found.gap <= within
+    assert found.gap == float(found.bound.gap(run.episode_circularity)[0])
+
+
+def test_no_time_is_time_for_the_first_bound(degrees: list[int]) -> None:
+    """Nothing is begun that cannot be had in the time left, neither a step nor a further degree."""
+    found = close_gap(SHORT, within=1e-4, seconds=0.0, min_service=0.95)
+    assert degrees == [1]
+    np.testing.assert_array_equal(found.bound.actions, bound(SHORT, min_service=0.95, degree=1, tight=True).actions)
+    assert found.gap > 0.01
+
+
+def test_a_solver_that_fails_takes_nothing_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the first degree it is an error, at a later one the end."""
+
+    def failing(*network: Any, degree: int, **options: Any) -> Bound:
+        if degree in fails:
+            raise CirlError(f"degree {degree}")
+        solution: Bound = bound(*network, degree=degree, **options)
+        return solution
+
+    monkeypatch.setattr(closing, "bound", failing)
+    fails = {2}
+    assert close_gap(SHORT, min_service=0.95).bound.degree == 1
+    fails = {1}
+    with pytest.raises(CirlError, match="degree 1"):
+        close_gap(SHORT, min_service=0.95)
+
+
+def test_plans_are_made_again_while_one_is_short(degrees: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A plan that keeps what is demanded stays; one that does not has no gap, and is made again from the next bound."""
+    made = list[int]()
+
+    def short(found: Bound, **options: Any) -> Bound:
+        made.append(found.degree)
+        if found.degree > 1:
+            return improve_plan(found, **options)
+        return replace(found, actions=0.0 * found.actions + EMPTYING)
+
+    monkeypatch.setattr(closing, "improve_plan", short)
+    found = close_gap(SHORT, within=1e-4, degrees=(1, 2, 3), min_service=0.95)
+    assert degrees == [1, 2, 3] and made == [1, 2]
+    assert found.gap < 0.01
+    degrees.clear()
+    assert math.isnan(close_gap(SHORT, degrees=(1,), min_service=0.95).gap)
+
+
+def test_steps_that_promise_little_are_not_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    """But while a service is short any gain is worth a step."""
+    solved = list[None]()
+
+    def counted(*arguments: Any) -> Any:
+        solved.append(None)
+        return jacobians(*arguments)
+
+    monkeypatch.setattr(improve, "jacobians", counted)
+    found, counts = bound(SHORT, min_service=0.95, degree=1), list[int]()
+    found = replace(found, actions=0.0 * found.actions + EMPTYING)
+    for least in (improve.NO_PROMISE, 1.0):
+        solved.clear()
+        run = simulate_plan(improve_plan(found, rounds=5, least_gain=least))
+        assert run.episode_levels.min() >= 0.95 - improve.TOLERATED_SHORTFALL
+        counts.append(len(solved))
+    assert 1 < counts[1] < counts[0]
+
+
+@pytest.mark.parametrize(("options", "message"), [({"within": 0.0}, "within 0.0"), ({"degrees": ()}, "degrees")])
+def test_what_cannot_be_asked(options: dict[str, Any], message: str) -> None:
+    """A gap is positive, and some program has to be solved."""
+    with pytest.raises(CirlError, match=message):
+        close_gap(SHORT, **options)
