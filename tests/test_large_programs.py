@@ -325,9 +325,13 @@ def test_simplex_is_tried_where_interior_points_do_not_do(
     assert tried == [*solver.SETTINGS][:count]
 
 
-def test_a_proof_of_many_variables_waits_for_no_crossover(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Interior points alone are tried first, and are near enough at 1e-4."""
+@pytest.mark.parametrize(("limit", "merged"), [("PROOF_PROGRAM", False), ("MERGED_PROOF", True)])
+def test_a_proof_of_many_variables_waits_for_no_crossover(
+    limit: str, merged: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Interior points alone are tried first, of fewer where pieces are merged, and are near enough at 1e-4."""
     problem = bound("copper_net", min_service=0.9, degree=1, horizon=4).problem
+    monkeypatch.setattr(problem.layout, "has_end_flows", merged)
     tried, run = list[Any](), solver._ScaledProgram.run
 
     def noted(scaled: Any, options: Any, start: Any, **others: Any) -> Any:
@@ -336,7 +340,7 @@ def test_a_proof_of_many_variables_waits_for_no_crossover(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(solver._ScaledProgram, "run", noted)
     monkeypatch.setattr(solver._ScaledProgram, "distance", lambda *_: (solver.OPTIMAL + solver.FAIR) / 2)
-    monkeypatch.setattr(solver, "PROOF_PROGRAM", len(problem.cost))
+    monkeypatch.setattr(solver, limit, len(problem.cost))
     solver.solve(problem)
     assert tried == [solver.INTERIOR_SETTINGS[0]]
 
@@ -354,7 +358,7 @@ def test_interior_points_alone_leave_good_multipliers(monkeypatch: pytest.Monkey
         return distances[-1]
 
     monkeypatch.setattr(solver._ScaledProgram, "distance", noted)
-    monkeypatch.setattr(solver, "PROOF_PROGRAM", 0)
+    monkeypatch.setattr(solver, "MERGED_PROOF", 0)
     assert solver.solve(problem).basis is None
     assert len(distances) == 1 and distances[0] <= solver.OPTIMAL
     first = dict(solver.INTERIOR_SETTINGS[0])

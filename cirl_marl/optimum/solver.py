@@ -50,10 +50,13 @@ without them do not, and leave no basis.
 """
 INTERIOR_SETTINGS: tuple[HighsOptions, ...] = ({**SETTINGS[1], "kkt_tolerance": 1e-6}, *SETTINGS)
 """What is tried for a program of which multipliers have to prove something, from PROOF_PROGRAM variables on."""
-PROOF_PROGRAM = 18_000
-"""Variables from which on a proof is by interior points alone. Of 17 388 (a cycle with lifetimes, seed 199, degree 1)
-they prove it within 1e-4 in 10 s, while HiGHS gives up after 17 s where crossover is asked for. Crossover ends for the
-17 885 of copper_world."""
+PROOF_PROGRAM, MERGED_PROOF = 18_000, 12_000
+"""Variables from which on a proof is by interior points alone, the latter where pieces are merged.
+
+Crossover ends for the 17 885 of copper_world, and for the 17 687 of seed 172 of the cycles with lifetimes, 7 s in all.
+Rows about the ends of merged pieces hold fast stocks several times over, and it is slower: for 15 064 (seed 6, degree
+2) 15.7 s in all, where interior points prove as much in 6.8; for 17 388 (seeds 158 and 199) HiGHS gives up after 19.
+"""
 EXTRA = "highspy_extras"
 """Package that brings HiPO."""
 LARGE_PROGRAM = 100_000
@@ -162,7 +165,7 @@ def solve(
         attempts = MIDDLING_SETTINGS if len(problem.cost) >= HIPO_PROGRAM else SETTINGS[1:2]
     elif is_large:
         attempts = (ROUGH_SETTINGS, *LARGE_SETTINGS) if is_rough else LARGE_SETTINGS
-    elif certify and len(problem.cost) >= PROOF_PROGRAM:
+    elif certify and len(problem.cost) >= (MERGED_PROOF if problem.layout.has_end_flows else PROOF_PROGRAM):
         attempts = INTERIOR_SETTINGS
     if not find_spec(EXTRA):  # HiGHS would take another solver for HiPO
         attempts = [settings for settings in attempts if settings["solver"] != "hipo"]
