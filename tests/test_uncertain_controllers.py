@@ -389,6 +389,11 @@ def test_a_bound_goes_with_its_own_episodes() -> None:
         (lambda: MPC(futures=0), "futures must be a whole number of at least 1, got 0"),
         (lambda: MPC(futures=4, replan=2), "only the first decision is carried out"),
         (lambda: MPC(margin=0.0), "margin 0.0 must be positive"),
+        (lambda: MPC(reserve=0.0), "reserve 0.0 must be positive"),
+        (
+            lambda: rollout(MultiAgentVectorEnv(in_use(), num_envs=1), MPC(reserve=1.1), seed=0),
+            "reserve 1.1: nothing is disturbed in",
+        ),
         (lambda: BestConstant(draws=1), "draws 1: too few"),
     ],
 )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.errors import CirlError, check_names
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.network.elements import OBSERVE, Arc
+from cirl_marl.network.elements import FIXED_LIFETIME, OBSERVE, Arc
 from cirl_marl.network.processes import DisturbanceProcesses, interval_of
 from cirl_marl.network.rowsum import NEGLIGIBLE, RowSum, spans
 
@@ -269,6 +269,7 @@ class ObservationLayout:
             ends = filter(None, (compartment.donor, compartment.recipient, compartment.capacity_node))
             near = [network.node_index[end] for end in ends]
             yield from near
+            yield from self._arrivals(near[1])
         yield from (rows[place] for rows in signals.contents for place in dict.fromkeys((position, *near)))
         arcs = [] if is_arc and mode != "neighbours" else [k for node in near for k in self._incident[node]]
         yield from (signals.flows.start + k for k in arcs)
@@ -286,6 +287,14 @@ class ObservationLayout:
             if not agents or agent in agents:
                 yield from (signals.seen.start + row for row in rows)
         yield signals.time
+
+    def _arrivals(self, node: int) -> Iterator[int]:
+        """Nodes into which one of fixed lifetime, such as a transport, releases: who orders ahead sees what for."""
+        lifetime = self._network.nodes[node].lifetime
+        if lifetime is not None and lifetime.distribution == FIXED_LIFETIME:
+            yield from (
+                int(self._network.recipients[k]) for k in self._incident[node] if self._network.donors[k] == node
+            )
 
     def _across(self, node: int) -> list[int]:
         """Nodes at the other end of the arcs of ``node``."""

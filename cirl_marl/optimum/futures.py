@@ -7,13 +7,16 @@ for many intervals as for few is done once, and intervals that are alike have th
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.disturbances import Gaussian
+from cirl_marl.network.series import in_intervals
 from cirl_marl.network.uncertainty import draw_network, network_of_intervals
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.content_ranges import present_contents
@@ -39,6 +42,7 @@ class DrawnFutures:
         service_weight: float | None,
         count: int | None,
         delay: int = 0,
+        reserve: float = 1.0,
     ) -> None:
         """Prepare them.
 
@@ -49,8 +53,10 @@ class DrawnFutures:
             service_weight: see ``Programs``.
             count: how many are drawn for each copy; None: one, of conditional means.
             delay: intervals by which the states are late from which means are conditional.
+            reserve: by what the lower ends of services are multiplied after the first interval.
         """
         self._env, self._reference, self._count, self._delay = env, reference, count, delay
+        self._reserve = reserve
         self._degree, self._weight = degree, service_weight
         network, processes = env.network, env.network.processes
         self._prior = processes.prior_means(network.episode.horizon)
@@ -76,7 +82,8 @@ class DrawnFutures:
         path = np.moveaxis(paths, 2, 0).reshape(-1, len(states))
         calendar = np.tile(np.arange(intervals.start, intervals.stop), paths.shape[2])
         stock = self._env.physical.stock[:, list(copies)]
-        future = self._future(draw_network(network_of_intervals(self._network, calendar), (), path), stock)
+        network = draw_network(network_of_intervals(self._network, calendar), (), path)
+        future = self._future(self._with_reserve(network, calendar > intervals.start), stock)
         futures = [future.at(place, step) for place in range(0, len(path), ahead)]
         each = self._count or 1
         return [futures[first : first + each] for first in range(0, len(futures), each)]
@@ -95,6 +102,15 @@ class DrawnFutures:
         """The network, with substeps that do for all that may be."""
         dynamics, network = self._env.dynamics, self._env.network
         return network.with_options(episode={"solver_step": dynamics.substep}) if dynamics.substeps > 1 else network
+
+    def _with_reserve(self, network: Network, is_later: NDArray[np.bool_]) -> Network:
+        """Return a network that wants more of its services in later intervals, so that plans keep something back."""
+        if self._reserve == 1.0:
+            return network
+        factor, length = np.where(is_later, self._reserve, 1.0), network.episode.control_interval
+        lows = (in_intervals(network.interval_means(service.low) * factor, length) for service in network.services)
+        services = tuple(replace(service, low=low) for service, low in zip(network.services, lows, strict=True))
+        return network.variant(services=services)
 
     def _future(self, network: Network, stock: Floats) -> Future:
         """Return a course of the network from some stocks, shape (masses, B)."""

@@ -188,6 +188,7 @@ class MPC(Planner):
         budget_margin: float = 1.0,
         prices: Prices | None = None,
         delay: int = 0,
+        reserve: float = 1.0,
     ) -> None:
         """Choose what is planned.
 
@@ -209,6 +210,8 @@ class MPC(Planner):
             prices: of a bound for who does not foresee (``bound(…, uncertain=True)``): a plan then looks a single
                 interval ahead, and what stocks are worth after it follows the states of the disturbances.
             delay: intervals by which disturbances are seen late; from the horizon on they are never seen.
+            reserve: by what the lower ends of services are multiplied in plans of a disturbed network, but for the
+                coming interval. Conditional means ask for nothing to be kept back; this does.
 
         Raises:
             CirlError: for an option that cannot be used.
@@ -216,6 +219,7 @@ class MPC(Planner):
         check_options(service_weight, min_service, degree)
         check_margin(margin)
         check_margin(budget_margin, "budget_margin")
+        check_margin(reserve, "reserve")
         if prices is not None and (not is_of_circularity(aim) or at_most):
             raise CirlError("prices are those of λ̄ and service: leave out aim and at_most")
         if service_weight is not None and not is_of_circularity(aim):
@@ -232,7 +236,7 @@ class MPC(Planner):
         if horizon is not None and horizon < (replan or 1):
             raise CirlError(f"horizon {horizon} is shorter than the {replan} decisions carried out of each plan")
         self._options = horizon, replan, futures
-        self._prices, self._delay = prices, delay
+        self._prices, self._delay, self._reserve = prices, delay, reserve
         self._margin, self._budget_margin, self._aim, self._at_most = margin, budget_margin, aim, at_most
         self._min_service, self._weight, self._degree = min_service, service_weight, degree
 
@@ -250,6 +254,8 @@ class MPC(Planner):
         self.note, self._env, is_disturbed = "", env, bool(network.disturbed)
         if self._prices is not None and len(self._prices.service) > len(network.services):
             raise CirlError("prices: those of a bound with budgets, which no plan of one interval can keep")
+        if self._reserve != 1.0 and not is_disturbed:
+            raise CirlError(f"reserve {self._reserve:g}: nothing is disturbed in '{network.name}'; take a margin")
         if horizon is not None and aims.budgets and not is_disturbed:
             raise CirlError(f"horizon {horizon}: whether a budget is kept depends on the whole episode; leave it out")
         self._horizon = (WINDOW if self._prices is None else 1) if horizon is None and is_disturbed else horizon
@@ -260,7 +266,7 @@ class MPC(Planner):
         expected, self._planners = self._future_as_expected(), dict[int, WindowPlanner]()
         self._planner, self._drawn = WindowPlanner([expected], self._weight), None
         if is_disturbed:
-            self._drawn = DrawnFutures(env, expected, self._degree, self._weight, futures, self._delay)
+            self._drawn = DrawnFutures(env, expected, self._degree, self._weight, futures, self._delay, self._reserve)
         dynamics, shape = expected.dynamics, (network.episode.horizon, len(env.actuators.control_rows))
         self._follows = self._climbs and not is_disturbed and slopes_of(shape, dynamics) <= MOST_SLOPES
         supplies = {arc.makes_up_for for arc in network.arcs if arc.makes_up_for and arc.id not in env.agents}
