@@ -1,6 +1,6 @@
 """Worlds in which feedback matters: nobody acting, a plan replayed blindly and a rule, at equal expected service.
 
-python -m benchmarks.uncertain [NETWORK ...]   # measures all six, or some (half an hour), and writes the table
+python -m benchmarks.uncertain [NETWORK ...]   # measures all, or some (half an hour), and writes the table
 python -m benchmarks.uncertain --table         # writes the table of what is kept in results/uncertain.json
 
 Each contender has one knob, which is set on draws of its own so that the lowest expected service is what is demanded:
@@ -62,6 +62,7 @@ WORLDS = (
     World("copper_world", "shocks", ("mining",)),
     World("paper_city", "breakdowns", ("feed", "bales_to_mill", "virgin_fibre")),
     World("car_batteries", "adoption", ("mining", "to_second_use")),
+    World("food_bank", "gluts", ("ordering",)),
 )
 
 
