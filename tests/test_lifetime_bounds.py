@@ -28,12 +28,13 @@ from cirl_marl import (
     Role,
     Series,
     Service,
+    load_network,
 )
 from cirl_marl.controllers import Constant, Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.network.elements import Lifetime
 from cirl_marl.network.lifetimes import Chain, chain_of
-from cirl_marl.optimum import bound, envelope, improve_plan, simulate_plan
+from cirl_marl.optimum import bound, envelope, improve_plan, simulate_plan, vintages
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.kernels import Kernel
 from cirl_marl.optimum.matrices import Layout
@@ -502,3 +503,16 @@ def test_prolonged_lifetimes_are_planned_below_the_bound() -> None:
     assert run.episode_levels[0].min() >= 0.9 - 1e-4
     assert without.objective < float(run.episode_circularity[0]) <= found.objective
     assert found.gap(run.episode_circularity)[0] < 0.1
+
+
+@pytest.mark.slow
+def test_bounds_of_degree_1_have_few_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are hardly looser for it, and no plan is above them."""
+    network = load_network("plastics_world").with_options(episode={"horizon": 4})
+    rough = bound(network, min_service=0.95, degree=1)
+    assert rough.at(rough.initial) == pytest.approx(rough.objective, rel=1e-12)
+    assert rough.gap(simulate_plan(improve_plan(rough, rounds=3)).episode_circularity)[0] >= 0.0
+    monkeypatch.setattr(vintages, "ROUGH", vintages.LOOSE)
+    fine = bound(network, min_service=0.95, degree=1)
+    assert rough.problem.layout.pieces < fine.problem.layout.pieces
+    assert rough.objective == pytest.approx(fine.objective, rel=1e-3)

@@ -20,6 +20,7 @@ from cirl_marl.optimum.options import by_stage
 from cirl_marl.optimum.program import Program, Programs
 from cirl_marl.optimum.solver import Basis, Infeasible, SolverFailure, solve
 from cirl_marl.optimum.stock_values import stock_values
+from cirl_marl.optimum.vintages import LOOSE
 
 LARGE_DRAW = 10_000
 """Variables of a draw's program beyond which substeps are merged: it is solved under many prices, each of many draws.
@@ -167,7 +168,9 @@ class DrawProgram:
         admissible = Admissible.of(draw.network, agents)
         self.draw, self.aims, lifetimes = draw, aims, admissible.lifetimes
         self._totals = lifetimes.totals
-        self._programs = Programs(admissible, degree, service_weight, constant_shares=False, large=LARGE_DRAW)
+        self._programs = Programs(
+            admissible, degree, service_weight, constant_shares=False, large=LARGE_DRAW, loose=LOOSE
+        )
         self.problem = self._programs.program(draw.initial)
         self.layout = self.problem.layout
         self.bookings = account_rows(lifetimes, self.layout, draw.initial, aims.rates(lifetimes.network))

@@ -100,6 +100,7 @@ class Programs:
         *,
         merge_pieces: bool | None = None,
         large: int | None = None,
+        loose: float | None = None,
         constant_shares: bool = True,
         steady_parts: bool = False,
         system: ComparisonSystem | None = None,
@@ -118,6 +119,7 @@ class Programs:
             merge_pieces: whether an interval has fewer pieces than the simulator has substeps; None: if the program
                 were large otherwise.
             large: variables beyond which it is; None: ``LARGE``.
+            loose: how far bounds of what leaves lifetimes may be apart (``Lifetimes.pieces``).
             constant_shares: whether shares of what passes nodes without stock are constant within an interval, unless
                 the degree is 0, the program large or its layout given.
             steady_parts: whether what is constant of flows that may vary has variables for these: tighter, and slower.
@@ -138,7 +140,9 @@ class Programs:
         self._transit: Transit | None = None
         self._ledger = Ledger(lifetimes.network)
         excesses = len(self._ledger.excesses)
-        self.layout = layout = layout or _layout(admissible, system.substeps, merge_pieces, degree, large, excesses)
+        self.layout = layout = layout or _layout(
+            admissible, system.substeps, merge_pieces, degree, large, excesses, loose
+        )
         if constant_shares and layout.size * len(admissible.kinds) <= LARGE:
             transit = Transit(admissible, system.substeps, steady_parts=steady_parts)
             if len(transit.splits):
@@ -307,9 +311,10 @@ def _layout(
     degree: int,
     large: int | None = None,
     excesses: int = 0,
+    loose: float | None = None,
 ) -> Layout:
     network, nodes = admissible.network, len(admissible.network.nodes)
-    pieces = admissible.lifetimes.pieces(degree, substeps) if admissible.lifetimes.whole else substeps
+    pieces = admissible.lifetimes.pieces(degree, substeps, loose) if admissible.lifetimes.whole else substeps
     exits = np.bincount(network.donors[admissible.driver == network.donors], minlength=nodes)
     schedules = np.bincount(network.donors[admissible.by_schedule], minlength=nodes)
     movable = (admissible.valve[0] < admissible.valve[1]).any(axis=0)

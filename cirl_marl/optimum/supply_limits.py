@@ -27,6 +27,7 @@ from cirl_marl.optimum.certificate import verify
 from cirl_marl.optimum.constraints import idle_groups
 from cirl_marl.optimum.program import LARGE, Program, Programs, possible_range
 from cirl_marl.optimum.solver import solve
+from cirl_marl.optimum.vintages import LOOSE
 
 PROOF_DEGREE = 1
 """Degree of the programs, several of which are solved; the least is enough to tell far from near."""
@@ -51,7 +52,7 @@ def with_supply_limits(bound: Bound, least: float) -> Network:
     groups = [] if network.substances or bound.problem.cost.size > LARGE else idle_groups(admissible)
     if not groups:
         return network
-    programs, intervals = Programs(admissible, PROOF_DEGREE, None), range(network.episode.horizon)
+    programs, intervals = Programs(admissible, PROOF_DEGREE, None, loose=LOOSE), range(network.episode.horizon)
     problem = programs.program(bound.initial, bound.min_service, aims=replace(bound.aims, budgets=()))
     reward = sparse.csr_array(problem.cost[None])
     problem = replace(

@@ -42,6 +42,7 @@ from cirl_marl.optimum.linearised import Later
 from cirl_marl.optimum.matrices import IntervalCache, Layout, ProgramRows
 from cirl_marl.optimum.program import Program, Programs
 from cirl_marl.optimum.solver import LARGE_PROGRAM, Basis, Infeasible, Solution, SolverFailure, solve
+from cirl_marl.optimum.vintages import LOOSE
 from cirl_marl.optimum.window_simulator import WindowSimulator, service_measures
 from cirl_marl.optimum.windows import (
     DISTANCE,
@@ -142,7 +143,7 @@ class Future:
             self._counts = self.aims.counts(self._ledger) if like is None else like._counts
             self._rate_tables: RateTables = self._ledger.rates(with_discount=False)
         if like is None:
-            self._programs = Programs(admissible, degree, service_weight, constant_shares=False)
+            self._programs = Programs(admissible, degree, service_weight, constant_shares=False, loose=LOOSE)
         else:
             admissible.lifetimes.cache = like.admissible.lifetimes.cache
             self._programs = Programs(admissible, degree, service_weight, layout=like.layout, cache=self.cache)
