@@ -135,25 +135,25 @@ class Outcome:
 
 def planned(seed: int, family: Family = RATES) -> Outcome:
     """Bound the network of a seed, and improve its plan while there is time."""
-    begun = time.process_time()
+    start = time.process_time()
     network = yearly_network(seed, family)
     size = len(network.nodes), network.episode.horizon
     level = SERVICE if network.services else None
     try:
-        closing = close_gap(network, within=GAP, seconds=LIMIT, min_service=level)
+        closure = close_gap(network, within=GAP, seconds=LIMIT, min_service=level)
     except CirlError as missing:
-        return Outcome(seed, *size, seconds=time.process_time() - begun, reason=str(missing))
-    seconds, found, reason = time.process_time() - begun, closing.bound, ""
-    if found.verify().bound != found.objective:
+        return Outcome(seed, *size, seconds=time.process_time() - start, reason=str(missing))
+    seconds, solution, reason = time.process_time() - start, closure.bound, ""
+    if solution.verify().bound != solution.objective:
         reason = "the certificate does not prove the bound"
-    elif np.isnan(closing.gap):
+    elif np.isnan(closure.gap):
         reason = "the plan misses services"
-    elif closing.gap > GAP:
-        reason = f"a gap of {closing.gap:.2%}"
+    elif closure.gap > GAP:
+        reason = f"a gap of {closure.gap:.2%}"
     elif seconds > LIMIT:
         reason = f"{seconds:.0f} s"
-    proved = found.objective / network.objective.circularity_scale
-    return Outcome(seed, *size, proved, closing.gap, found.degree, seconds, reason)
+    highest = solution.objective / network.objective.circularity_scale
+    return Outcome(seed, *size, highest, closure.gap, solution.degree, seconds, reason)
 
 
 def planned_apart(seed: int, family: Family) -> Outcome:

@@ -3,7 +3,7 @@
 from cirl_marl.optimum.admissible import NoCertificate
 from cirl_marl.optimum.bounds import Bound, Envelope, bound, envelope, gap
 from cirl_marl.optimum.certificate import Certificate, Verification
-from cirl_marl.optimum.closing import Closing, close_gap
+from cirl_marl.optimum.closing import GapClosure, close_gap
 from cirl_marl.optimum.cross_entropy import Incumbent, search, search_each, standard_candidates
 from cirl_marl.optimum.draw_proofs import Sampling
 from cirl_marl.optimum.improve import improve_plan
@@ -14,8 +14,8 @@ from cirl_marl.optimum.uncertain_bound import UncertainBound
 __all__ = [
     "Bound",
     "Certificate",
-    "Closing",
     "Envelope",
+    "GapClosure",
     "Incumbent",
     "NoCertificate",
     "Plan",

@@ -34,7 +34,7 @@ NEGLIGIBLE = 0.05
 
 
 @frozen_record
-class Closing:
+class GapClosure:
     """What came of it."""
 
     bound: Annotated[Bound, "the lowest that was proved, with the actions of the best plan"]
@@ -51,7 +51,7 @@ def close_gap(
     degrees: Sequence[int] = DEGREES,
     min_service: ArrayLike | None = None,
     **options: Any,
-) -> Closing:
+) -> GapClosure:
     """Return a plan and a bound that are ``within`` a gap of each other, or as near as they come in the time.
 
     Args:
@@ -66,41 +66,41 @@ def close_gap(
         CirlError: as ``bound`` of the first degree does.
     """
     check_margin(within, "within")
-    begun = time.process_time()
+    start = time.process_time()
 
-    def used() -> float:
-        return time.process_time() - begun
+    def clock() -> float:
+        return time.process_time() - start
 
-    proved: Bound | None = None
+    tightest: Bound | None = None
     run: Rollout | None = None
     for degree in degrees:
-        start = used()
+        bound_start = clock()
         try:
-            found = bound(network, min_service=min_service, degree=degree, tight=degree <= TIGHT, **options)
+            solution = bound(network, min_service=min_service, degree=degree, tight=degree <= TIGHT, **options)
         except CirlError:
-            if proved is None:
+            if tightest is None:
                 raise
             break  # a solver that fails at a higher degree takes nothing back
-        took = used() - start
-        actions = found.actions if proved is None else proved.actions
-        if proved is None or found.objective < proved.objective:
-            proved = replace(found, actions=actions)
+        duration = clock() - bound_start
+        actions = solution.actions if tightest is None else tightest.actions
+        if tightest is None or solution.objective < tightest.objective:
+            tightest = replace(solution, actions=actions)
 
-        def is_enough(episode: Rollout, proved: Bound = proved) -> bool:
-            return _gap(proved, episode) <= within or used() > seconds
+        def is_enough(episode: Rollout, tightest: Bound = tightest) -> bool:
+            return _gap(tightest, episode) <= within or clock() > seconds
 
-        if run is None or math.isnan(_gap(proved, run)):
-            plan = improve_plan(found, least_gain=NEGLIGIBLE * within, enough=is_enough)
-            proved, run = replace(proved, actions=plan.actions), simulate_plan(plan)
-        if is_enough(run) or used() + LONGER * took > seconds:
+        if run is None or math.isnan(_gap(tightest, run)):
+            plan = improve_plan(solution, least_gain=NEGLIGIBLE * within, enough=is_enough)
+            tightest, run = replace(tightest, actions=plan.actions), simulate_plan(plan)
+        if is_enough(run) or clock() + LONGER * duration > seconds:
             break
-    if proved is None or run is None:
+    if tightest is None or run is None:
         raise CirlError("degrees: give at least one")
-    return Closing(bound=proved, run=run, gap=_gap(proved, run), seconds=used())
+    return GapClosure(bound=tightest, run=run, gap=_gap(tightest, run), seconds=clock())
 
 
-def _gap(proved: Bound, run: Rollout) -> float:
+def _gap(solution: Bound, run: Rollout) -> float:
     """Return the gap of an episode; NaN if it is short of what is demanded."""
-    if shortage(proved, run) > TOLERATED_SHORTFALL:
+    if shortage(solution, run) > TOLERATED_SHORTFALL:
         return math.nan
-    return float(gap(proved.objective, proved.aims.value(run)))
+    return float(gap(solution.objective, solution.aims.value(run)))
