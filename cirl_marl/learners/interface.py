@@ -179,9 +179,9 @@ def _first_trainings(training: Training) -> Iterator[tuple[list[str], Training]]
         yield names, prepare(env.network, recipe, steps=steps, seed=config.seed, agents=env.agents, **options)
 
 
-def _report_part(report: TrainingReport, began: float, done: int, others: int, now: Progress) -> None:
+def _report_part(report: TrainingReport, began: float, done: int, remainder: int, now: Progress) -> None:
     seconds = time.perf_counter() - began
-    report(replace(now, env_steps=done + now.env_steps, total=others + now.total, seconds=seconds))
+    report(replace(now, env_steps=done + now.env_steps, total=remainder + now.total, seconds=seconds))
 
 
 def prepare(
