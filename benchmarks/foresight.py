@@ -448,6 +448,7 @@ def main() -> None:
             rows = entry.get("contenders", {})
             if name in LEARNERS:
                 figures |= {"seeds": options.seeds, "steps": options.steps}
+                figures["milliseconds"] /= options.seeds  # all teams act in all draws
                 for gaps in [rows[p]["gap_by_draw"] for p in CERTAIN if "gap_by_draw" in rows.get(p, {})][:1]:
                     figures["less_than_mpc"] = less_than_planner(seen, teams, gaps)
             rows = {**rows, name: figures}
