@@ -71,9 +71,9 @@ def test_pieces_are_merged_where_stocks_are_fast(
 ) -> None:
     """A large program has one piece a year; rows about its end only if stocks turn over twice in it."""
     admissible = Admissible.of(network)
-    fine = program._layout(admissible, 2, False, 1)
+    fine = program._layout(admissible, 2, False, 2)
     monkeypatch.setattr(program, "LARGE", 0)
-    layout = program._layout(admissible, 2, None, 1)
+    layout = program._layout(admissible, 2, None, 2)
     assert (fine.pieces, layout.pieces, layout.coarse, layout.has_end_flows) == (2, 1, True, merged)
 
 

@@ -197,7 +197,8 @@ def _markets(network: Network) -> Iterator[str]:
 def _short_flows(env: MultiAgentVectorEnv, neutral: Callable[[], Rollout]) -> Iterator[str]:
     """Yield scheduled flows that run short: under neutral control, and from sources whose controls are at the highest.
 
-    A source is a donor that nothing enters. That agents can empty others is no fault of the network.
+    A source is a donor that nothing enters. That agents, or what nobody foresees, can empty others is no fault of the
+    network.
     """
     network = env.network
     scheduled_donors = {arc.id: arc.donor for arc in network.arcs if LAWS[arc.law].is_scheduled}
@@ -210,7 +211,7 @@ def _short_flows(env: MultiAgentVectorEnv, neutral: Callable[[], Rollout]) -> It
     sources = {id_ for arc, donor in scheduled_donors.items() if donor not in recipients for id_ in (arc, donor)}
     highest = {agent: 1.0 for agent in network.agents if agent in sources and _scales(network, agent)}
     reported: set[str] = set()
-    checks = [("neutral", neutral, set(scheduled_donors))]
+    checks = [("neutral", neutral, sources if network.disturbed else set(scheduled_donors))]
     if highest:
         checks.append(("the highest", partial(episode_start(env).play, env, Constant(highest)), sources))
     for control, run, looked_at in checks:
