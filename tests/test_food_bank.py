@@ -60,3 +60,16 @@ def test_plans_for_what_is_expected_keep_nothing_back_unless_told() -> None:
         for reserve in (1.0, 1.4)
     )
     assert kept_back > dear + 0.02
+
+
+def test_a_reserve_is_for_the_days_to_come() -> None:
+    """Of today no more is served than is demanded, though twice as much of what comes after is planned for."""
+    env = MultiAgentVectorEnv("food_bank", num_envs=4, scenario="gluts", horizon=6)
+    planner = MPC(min_service=0.99, reserve=2.0)
+    observations = env.reset(seed=5)
+    planner.start(env, 0)
+    outcome = env.advance(env.stack(planner.act(observations)))
+    guests = env.team_info(outcome)["disturbances"]["guests"]
+    served = outcome.flow[env.network.arc_index["serving"]]
+    np.testing.assert_array_less(served, 20.0 * guests * 1.001)
+    assert (served > 10.0).all()
