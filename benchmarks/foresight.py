@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.document import markdown_table, measured_table, write_sections
+from benchmarks.food_bank import BestOrders
 from benchmarks.uncertain import CLOSE, DEMANDED, WORLDS, World, entries
 from benchmarks.uncertain import RESULTS as KNOBS
 from benchmarks.uncertain import contenders as simple_contenders
@@ -99,8 +100,11 @@ CONTENDERS: Mapping[str, Callable[[World, UncertainBound], Maker]] = {
     ),
     "scenario_mpc": lambda world, found: partial(MPC, min_service=DEMANDED, horizon=WINDOW, futures=FUTURES),
     "price_policy": lambda world, found: partial(MPC, min_service=DEMANDED, prices=found.prices),
+    "dynamic_programming": lambda world, found: partial(BestOrders, found.network),
 }
 """Who acts, by name: what makes a controller with a ``margin`` in a world, given its bound."""
+SMALL = {"dynamic_programming": "food_bank"}
+"""Contenders that can act in a single world."""
 
 
 class Alternating(Controller):
@@ -431,6 +435,8 @@ def main() -> None:
             write_json(RESULTS, results)
             continue
         for name in options.only.split(","):
+            if SMALL.get(name, world.network) != world.network:
+                continue
             episodes = min(options.episodes, options.draws) if name in PLANNERS else options.draws
             seen, tune, margin = found, options.tune, 1.0
             if name in SIMPLE:

@@ -5,10 +5,14 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
+import pytest
 
+from benchmarks.food_bank import BestOrders
+from benchmarks.uncertain import Supplied
 from cirl_marl import MultiAgentVectorEnv, load_network
 from cirl_marl.controllers import Constant, Controller, ScriptController
 from cirl_marl.controllers.rollout import Rollout, first_seed, rollout
+from cirl_marl.network import Floats
 from cirl_marl.optimum.mpc import MPC
 
 
@@ -73,3 +77,22 @@ def test_a_reserve_is_for_the_days_to_come() -> None:
     served = outcome.flow[env.network.arc_index["serving"]]
     np.testing.assert_array_less(served, 20.0 * guests * 1.001)
     assert (served > 10.0).all()
+
+
+@pytest.mark.slow
+def test_dynamic_programming_expects_what_comes_about_and_nobody_does_better() -> None:
+    """Its value is the mean of its episodes, and no rule and no order of a quarter more or less has more."""
+    network = load_network("food_bank").scenario("gluts")
+    env, best = MultiAgentVectorEnv(network, num_envs=512), BestOrders(network)
+    env.reset(seed=first_seed(3))
+    expected = best.expected(env).mean()
+
+    def worth(controller: Controller) -> Floats:
+        run = rollout(env, controller, seed=first_seed(3))
+        return run.episode_circularity + best.price * run.episode_levels[:, 0]
+
+    own = worth(best)
+    assert abs(own.mean() - expected) < 3.0 * own.std() / 512**0.5
+    for other in (ScriptController(margin=1.3), Supplied(best, ["ordering"], 0.75), Supplied(best, ["ordering"], 1.25)):
+        less = own - worth(other)
+        assert less.mean() > 3.0 * less.std() / 512**0.5
