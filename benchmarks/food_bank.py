@@ -1,16 +1,18 @@
-"""The best that anybody can do in food_bank who sees all of the present, by dynamic programming.
+"""What fits food_bank alone: the best that can be done by who sees all of the present, and MPC with a safety stock.
 
-What is in store decays by a factor δ in an interval, and what comes can be served from the next one on. So the state is
-what can be served, y = δ·stock/κ with κ the part of a steady inflow that is left at its end, what is on the way, the
-regime of the surplus, and the latent value z of the guests. Where r = y − served + on the way + collected there are
-κ·r in store at the end, and δ·r to serve in the next interval. What spoils is what came in less what was served and
-what is left. Interpolation between points of a grid is the only approximation: tests/test_food_bank.py holds what is
-expected against episodes of the simulator.
+The best is found by dynamic programming. What is in store decays by a factor δ in an interval, and what comes can be
+served from the next one on. So the state is what can be served, y = δ·stock/κ with κ the part of a steady inflow that
+is left at its end, what is on the way, the regime of the surplus, and the latent value z of the guests. Where r = y −
+served + on the way + collected there are κ·r in store at the end, and δ·r to serve in the next interval. What spoils
+is what came in less what was served and what is left. Interpolation between points of a grid is the only
+approximation: tests/test_food_bank.py holds what is expected against episodes of the simulator.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +21,7 @@ from cirl_marl.controllers import Controller
 from cirl_marl.controllers.basic import Arrays
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.disturbances import Gaussian, Markov
+from cirl_marl.optimum.mpc import MPC
 
 STEP, MOST = 0.5, 130.0
 """Distance between points of a mass, and the last of them, t."""
@@ -28,8 +31,8 @@ NODES = 15
 """Of the Gauss–Hermite rule for the noise of z."""
 SHARES = np.linspace(0.0, 1.0, 11)
 """Parts of the surplus of which the best is collected."""
-PRICE = 70.0
-"""Of a level of service of 1 at a margin of 1, t."""
+PRICE, NORMAL = 70.0, 0.75
+"""Of a level of service of 1, t, and standard deviations in reserve, both at a margin of 1."""
 
 
 class BestOrders(Controller):
@@ -122,6 +125,38 @@ class BestOrders(Controller):
         order = _looked_up(self._orders[step], regime, place, left[best, np.arange(len(best))])
         amounts = {"ordering": order, "collecting": SHARES[best], "serving": served}
         return {agent: self._env.normalise(agent, amount[None]) for agent, amount in amounts.items()}
+
+
+class SafetyStock(Controller):
+    """MPC whose reserve for the days to come is so many standard deviations of what is wanted less what is set aside.
+
+    The deviation is that of the next interval, and follows the regime.
+    """
+
+    def __init__(self, network: Network, options: Mapping[str, Any], margin: float = 1.0) -> None:
+        """Take the network, options of ``MPC``, and the number of deviations in parts of NORMAL."""
+        surplus, guests = network.processes.disturbances
+        assert isinstance(surplus, Markov) and isinstance(guests, Gaussian)
+        numbers = (network.arcs[network.arc_index["set_aside"]].flow, network.services[0].low)
+        flow, wanted = (float(network.interval_means(number)[0]) for number in numbers)
+        matrix, values = np.array(surplus.matrix), np.array(surplus.values)
+        variance = matrix @ values**2 - (matrix @ values) ** 2
+        deviations = np.hypot(flow / wanted * np.sqrt(variance), guests.deviation * guests.memory[1])
+        kinds, self._kind = np.unique(deviations.round(9), return_inverse=True)
+        self._planners = [MPC(reserve=1.0 + NORMAL * margin * kind, **options) for kind in kinds]
+
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
+        """Start a planner for every deviation."""
+        self._env = env
+        for planner in self._planners:
+            planner.start(env, seed)
+
+    def act(self, observations: Arrays) -> Arrays:
+        """Return in each copy what the planner for its regime does."""
+        regimes = self._env.physical.processes[int(self._env.physical.step[0])][0].astype(np.intp)
+        plans = [planner.act(observations) for planner in self._planners]
+        copies = np.arange(len(regimes))
+        return {agent: np.stack([plan[agent] for plan in plans])[self._kind[regimes], copies] for agent in plans[0]}
 
 
 def _moves(memory: float, noise: float) -> Floats:

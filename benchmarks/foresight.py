@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.document import markdown_table, measured_table, write_sections
-from benchmarks.food_bank import BestOrders
+from benchmarks.food_bank import BestOrders, SafetyStock
 from benchmarks.uncertain import CLOSE, DEMANDED, WORLDS, World, entries
 from benchmarks.uncertain import RESULTS as KNOBS
 from benchmarks.uncertain import contenders as simple_contenders
@@ -54,7 +54,7 @@ WINDOW, FUTURES, DEAR = 3, 4, 3.0
 """Decisions that MPC looks ahead, futures that scenario MPC plans for, and the margin of MPC with a reserve."""
 SIMPLE = ("neutral", "plan", "rule")
 """Contenders of ``benchmarks.uncertain``, whose knobs are set there."""
-CERTAIN = ("mpc_with_reserve", "mpc")
+CERTAIN = ("safety_stock", "mpc_with_reserve", "mpc")
 """Certainty-equivalent MPC: learners are compared to the first of these that was measured."""
 PLANNERS = (*CERTAIN, "scenario_mpc", "price_policy")
 """Contenders that solve a program for every decision, of which fewer episodes are measured."""
@@ -100,10 +100,13 @@ CONTENDERS: Mapping[str, Callable[[World, UncertainBound], Maker]] = {
     ),
     "scenario_mpc": lambda world, found: partial(MPC, min_service=DEMANDED, horizon=WINDOW, futures=FUTURES),
     "price_policy": lambda world, found: partial(MPC, min_service=DEMANDED, prices=found.prices),
+    "safety_stock": lambda world, found: partial(
+        SafetyStock, found.network, {"min_service": DEMANDED, "horizon": WINDOW, "margin": DEAR}
+    ),
     "dynamic_programming": lambda world, found: partial(BestOrders, found.network),
 }
 """Who acts, by name: what makes a controller with a ``margin`` in a world, given its bound."""
-SMALL = {"dynamic_programming": "food_bank"}
+SMALL = dict.fromkeys(("safety_stock", "dynamic_programming"), "food_bank")
 """Contenders that can act in a single world."""
 
 

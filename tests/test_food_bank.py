@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
 
-from benchmarks.food_bank import BestOrders
+from benchmarks.food_bank import NORMAL, BestOrders, SafetyStock
 from benchmarks.uncertain import Supplied
 from cirl_marl import MultiAgentVectorEnv, load_network
 from cirl_marl.controllers import Constant, Controller, ScriptController
@@ -77,6 +78,26 @@ def test_a_reserve_is_for_the_days_to_come() -> None:
     served = outcome.flow[env.network.arc_index["serving"]]
     np.testing.assert_array_less(served, 20.0 * guests * 1.001)
     assert (served > 10.0).all()
+
+
+def test_a_safety_stock_follows_what_is_known_of_the_spread() -> None:
+    """In each copy that is done which MPC does with the reserve of its regime: five times as much in wild weeks."""
+    network = load_network("food_bank").scenario("gluts")
+    options: dict[str, Any] = {"min_service": 0.99, "margin": 3.0}
+    env = MultiAgentVectorEnv(network, num_envs=8, horizon=4)
+    observations = env.reset(seed=5)
+    regimes, values = env.physical.processes[0, 0].astype(int), np.array([1.0, 1.7, 0.3])
+    assert len(set(regimes.tolist())) == 3
+    controllers: list[Controller] = [SafetyStock(env.network, options)]
+    chances = np.array([[0.96, 0.02, 0.02], [0.1, 0.45, 0.45]])
+    spread = np.hypot(0.7 * np.sqrt(chances @ (values - 1.0) ** 2), 0.06)  # seven tenths of what is wanted; 0.1·0.6
+    controllers += [MPC(reserve=1.0 + NORMAL * deviation, **options) for deviation in spread.tolist()]
+    orders = []
+    for controller in controllers:
+        controller.start(env, 0)
+        orders.append(controller.act(observations)["ordering"][:, 0])
+    np.testing.assert_allclose(orders[0], np.where(regimes == 0, orders[1], orders[2]), atol=1e-9)
+    assert (orders[2] > orders[1]).any()
 
 
 @pytest.mark.slow
