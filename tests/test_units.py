@@ -76,6 +76,9 @@ def test_masses_that_say_which_ton(unit: str, kg: float) -> None:
         ("keur_2015", "EUR_2015", "for 'keur_2015' write EUR_2015"),
         ("t CO2/t", "t CO2e/t", "for 'CO2' write CO2e"),
         ("kgCO2eq/t", "t CO2e/t", "for 'kgCO2eq' write kg CO2e"),
+        ("pct", "kt", "for 'pct' write %"),
+        ("ppb", "1", "for 'ppb' write mg/t"),
+        *((unit, "1", "write nothing, as in '%' or 'ppm'") for unit in ("wt%", "wt.-%", "mass%", "% by weight")),
     ],
 )
 def test_units_that_cannot_be_used_say_what_to_write(unit: str, target: str, said: str) -> None:

@@ -42,7 +42,9 @@ def _ambiguity(symbol: str) -> str | None:
 
 
 MISSPELT = {"y": "year", "T": "t (tonne)", "MT": "Mt (megatonne)"} | dict.fromkeys(["kT", "Kt", "KT"], "kt (kilotonne)")
-"""Symbols that are written for a unit, and are none or another."""
+MISSPELT |= {"pct": "%", "ppmw": "ppm", "ppb": "mg/t"}
+MISSPELT |= dict.fromkeys(["wt", "mass", "weight"], "nothing, as in '%' or 'ppm': parts are of the mass")
+"""Symbols that are written for a unit, and are none or another: pint reads ``mass`` as an angle, ``pct`` as a mass."""
 
 
 CURRENCY = re.compile(r"[kMG]?([A-Z]{3})(_(?:18|19|20)\d\d)?")
