@@ -463,6 +463,16 @@ def test_few_solutions_bound_many_starts() -> None:
     np.testing.assert_allclose(proved, solved, rtol=0.01)
 
 
+@pytest.mark.parametrize(("start", "level", "members"), [(0.0, 0.0, 1), (1e-6, 0.0, 2), (0.0, 1e-4, 2)])
+def test_episodes_that_are_alike_need_one_solution(start: float, level: float, members: int) -> None:
+    """Those that differ in their start or in the service that is asked of them need more."""
+    middle = load_network("carbo_net").initial.mean(axis=0)
+    starts = middle * [[1.0], [1.0], [1.0 + start]]
+    levels = [[0.3], [0.3], [0.3 + level]]
+    found = envelope("carbo_net", starts, min_service=levels, solves=2, horizon=2, degree=1)
+    assert len(found.members) == members
+
+
 @pytest.mark.parametrize(
     ("initial", "level", "said"),
     [

@@ -35,6 +35,9 @@ from cirl_marl.optimum.program import Program, Programs, circularity_weights
 from cirl_marl.optimum.solver import FEASIBLE, Basis, Infeasible, solve
 from cirl_marl.optimum.uncertain_bound import UncertainBound, uncertain_bound
 
+SAME = 1e-12
+"""Relative difference of starts, and of levels, that are the same but for rounding."""
+
 
 def relative(difference: ArrayLike, reference: ArrayLike) -> Floats:
     """Return ``difference``/|``reference``| in the broadcast shape, NaN where the reference is 0."""
@@ -308,6 +311,7 @@ def envelope(
 
     The first is for the mean of the starts, each further one for the start where those before prove least: the best
     objective is a nearly concave function of the start, so what is proved from elsewhere is weakest where it is worst.
+    Episodes that are all alike need the first alone.
 
     Arguments and errors are those of ``bound``, but for ``initial``, stocks of shape (episodes, stores), mass;
     ``min_service``, of each service in each episode, shape (episodes, services), or what can be broadcast to it, such
@@ -328,6 +332,8 @@ def envelope(
     first = _solve_bound(programs, starts.mean(axis=0), service_weight, demand, basis)
     progress(1)
     bounds, candidates = Envelope((first,)), np.ones(len(starts), dtype=bool)
+    if _are_alike(starts) and (levels is None or _are_alike(levels)):
+        return bounds
     for count in range(min(solves - 1, len(starts))):
         worst = int(np.where(candidates, bounds.at(starts, levels), np.inf).argmin())
         candidates[worst] = False
@@ -336,6 +342,10 @@ def envelope(
         bounds = Envelope((*bounds.members, member))
         progress(count + 2)
     return bounds
+
+
+def _are_alike(rows: Floats) -> bool:
+    return np.allclose(rows, rows[:1], rtol=SAME, atol=0.0)
 
 
 def highest_service(network: Network) -> float:
