@@ -122,6 +122,20 @@ def test_a_scenario_is_that_of_the_copies_too(folder: Path) -> None:
     assert [arc.share for arc in network(folder, TEXT + half + one).arcs if arc.id.endswith("_sold")] == [0.5, 0.5]
 
 
+def test_what_is_in_copies_is_said_by_who_copies_them(folder: Path) -> None:
+    """Contents are those of each region; of a substance, or an account, that both files have, the own one holds."""
+    part = f'content.iron = {{ file = "content.csv", column = "iron", where = {{ country = "{{region}}" }}, {ONE} }}\n'
+    iron, own = (f"[substances.iron]\nscale = {{ value = {scale}, {ONE} }}\n" for scale in (0.2, 0.5))
+    cost, dollars = (f'[accounts.cost]\nunit = "{unit}"\n' for unit in ("EUR_2020", "USD_2020"))
+    written(folder, COPIED.replace("[nodes.mine]", f"{iron}{cost}[nodes.mine]\n{part}"))
+    (folder / "content.csv").write_text("country,iron\nJapan,0.3\nChina,0.6\n", encoding="utf-8")
+    found = network(folder, TEXT.replace("[nodes.port]", own + dollars + "[nodes.port]"))
+    assert [(part.id, part.scale) for part in found.substances] == [("iron", 0.5)]
+    assert [account.unit for account in found.accounts] == ["USD_2020"]
+    contents = {node.id: dict(node.content) for node in found.nodes if node.content}
+    assert contents == {"japan_mine": {"iron": 0.3}, "china_mine": {"iron": 0.6}}
+
+
 def test_some_regions_and_less_of_each(folder: Path) -> None:
     """What is left out of the copies need not be left out again by their scenarios."""
     text = TEXT.replace(COPIES, COPIES + 'regions = ["china"]\nwithout = ["services.in_use", "nodes.dump"]\n')
