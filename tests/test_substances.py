@@ -461,10 +461,15 @@ def test_scheduled_flows_carry_the_content_at_the_start_of_a_substep() -> None:
 
 
 def test_observations_show_own_content() -> None:
-    """A compartment sees the content of itself and of its ends, in parts of the scale of the substance."""
-    env = MultiAgentVectorEnv(sorting_line(controlled=True), num_envs=1)
+    """A compartment sees the content of itself and of its ends, in parts of the scale of each substance."""
+    network = sorting_line(controlled=True)
+    use = replace(network.nodes[0], content={"copper": 0.02, "tin": 0.03})
+    substances = (*COPPER, Substance(id="tin", scale=0.3))
+    network = replace(network, nodes=(use, *network.nodes[1:]), substances=substances)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     seen = dict(zip(env.observation_names["rejects"], env.reset(seed=0)["rejects"][0].tolist(), strict=True))
     assert seen["copper in shredder"] == pytest.approx(2.0, rel=1e-6)
+    assert seen["tin in shredder"] == pytest.approx(0.1, rel=1e-6)
     assert seen["copper in rejects"] == pytest.approx(0.5 * 0.02 / (0.1 * 0.98 + 0.5 * 0.02) / 0.01, rel=1e-6)
 
 
