@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 from cirl_marl import (
     Account,
     CirlError,
+    Substance,
     load_network,
     simulate,
     write_network,
@@ -93,13 +94,16 @@ def test_a_data_package_has_a_network_and_its_episode(tmp_path: Path, name: str)
     name, _, scenario = name.partition(".")
     network = load_network(name, scenario=scenario or None) if name != "city" else city()
     network = network.with_options(episode={"horizon": 5})
+    if network.substances:
+        nodes = (replace(n, content={**dict(n.content), "tin": 1e-4}) if n.history else n for n in network.nodes)
+        network = replace(network, nodes=tuple(nodes), substances=(*network.substances, Substance(id="tin")))
     done = simulate(network, steps=5)
     descriptor = json.loads(write_package(tmp_path / "package", done).read_text(encoding="utf-8"))
     assert {part["name"] for part in descriptor["resources"]} >= {"nodes", "arcs", "stocks", "flows", "accounts"}
     back, run = read_package(tmp_path / "package"), done.rollout
     assert (back.scenario, back.control) == (scenario or "default", "neutral")
     np.testing.assert_array_equal(back.contents, run.contents)
-    assert len(network.substances) == (scenario == "copper")
+    assert len(network.substances) == 2 * (scenario == "copper")
     np.testing.assert_array_equal(back.stock, np.concatenate([run.start[None], run.stock]))
     np.testing.assert_array_equal(back.flow, run.flow)
     np.testing.assert_array_equal(back.levels, run.levels[0].T)
