@@ -181,6 +181,18 @@ def test_bounds_are_of_the_contents_at_their_start() -> None:
                 ask()
 
 
+def test_bounds_allow_the_level_of_the_most_that_can_be_melted() -> None:
+    """All that is made is scrap, twice as impure as the limit: its level, one half, is what the most of it allows."""
+    network = sorter(low=0.0, high=0.02)
+    arcs = list(network.arcs)
+    arcs[1] = replace(arcs[1], control=Control(kind=ControlKind.FLOW, low=0.0, neutral=2.0, high=6.0))
+    plan = bound(replace(network, arcs=tuple(arcs)), horizon=2)
+    run = simulate_plan(replace(plan, actions=np.tile([-1.0, 1.0], (2, 1))))
+    assert run.episode_levels[0].tolist() == pytest.approx([1.0, 0.5])
+    limit = bound(plan.network, min_service=run.episode_levels[0] - 1e-6)
+    assert limit.objective == pytest.approx(run.episode_circularity[0], rel=1e-4)
+
+
 @pytest.mark.medium
 def test_uncertain_bounds_start_with_the_contents_that_are_drawn() -> None:
     """Whether the start is given or not, as the simulator does."""
