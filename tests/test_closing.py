@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cirl_marl import CirlError, load_network
+from cirl_marl import CirlError, load_network, plan
 from cirl_marl.optimum import Bound, bound, close_gap, closing, improve, improve_plan, simulate_plan
 from cirl_marl.optimum.slopes import jacobians
 
@@ -45,6 +45,14 @@ def test_as_many_programs_as_the_gap_asks_for(degrees: list[int], within: float,
     assert run.episode_levels.min() >= 0.95 - improve.TOLERATED_SHORTFALL
     assert 0.0 <= found.gap <= within
     assert found.gap == float(found.bound.gap(run.episode_circularity)[0])
+
+
+def test_a_plan_is_proved_as_far_as_is_asked(degrees: list[int]) -> None:
+    """``plan`` with a gap goes on to a tighter bound, and says how far the episode that it shows is from it."""
+    found = plan(SHORT, "optimum", min_service=0.95, smooth=False, gap=0.01)
+    assert degrees == [1, 2]
+    assert float(found.proof.split("gap ")[1].rstrip("%")) <= 1.0
+    assert found.rollout.episode_levels.min() >= 0.95 - improve.TOLERATED_SHORTFALL
 
 
 def test_no_time_is_time_for_the_first_bound(degrees: list[int]) -> None:
@@ -114,3 +122,22 @@ def test_what_cannot_be_asked(options: dict[str, Any], message: str) -> None:
     """A gap is positive, and some program has to be solved."""
     with pytest.raises(CirlError, match=message):
         close_gap(SHORT, **options)
+
+
+@pytest.mark.parametrize(
+    ("control", "demanded", "solver", "gap", "message"),
+    [
+        ("mpc", 0.9, "exact", 0.01, "--gap goes with --control optimum and --min-service"),
+        ("optimum", None, "exact", 0.01, "--gap goes with --control optimum and --min-service"),
+        ("optimum", 0.9, "exact", 0.0, "gap 0.0 must be positive"),
+        ("optimum", 0.9, "rk4", 0.01, "no bound is proved: solver 'rk4'"),
+    ],
+)
+def test_a_gap_to_what_there_is_no_bound_of(
+    control: str, demanded: float | None, solver: str, gap: float, message: str
+) -> None:
+    """Only plans of ``optimum`` for a demanded service have one, where something can be proved."""
+    step = SHORT.episode.control_interval / 100 if solver == "rk4" else None
+    network = SHORT.with_options(episode={"solver": solver, "solver_step": step})
+    with pytest.raises(CirlError, match=message):
+        plan(network, control, min_service=demanded, gap=gap)

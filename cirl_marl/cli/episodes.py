@@ -196,6 +196,10 @@ def plan(
         bool | None,
         typer.Option(help="Of optimum's plans of equal worth the one with least change; default: unless it is large."),
     ] = None,
+    gap: Annotated[
+        float | None,
+        typer.Option(help="Of optimum: prove and plan until it is at most this part of the bound, such as 0.01."),
+    ] = None,
     aim: Annotated[
         list[str] | None,
         typer.Option(
@@ -221,7 +225,7 @@ def plan(
         common.file_for(out, "--out", ".csv")
     page = common.page_for(html)
     options: dict[str, Any] = {"scenario": scenario, "min_service": min_service, "seed": seed, "smooth": smooth}
-    options |= {"aim": _aim(aim), "at_most": common.budgets(at_most)}
+    options |= {"gap": gap, "aim": _aim(aim), "at_most": common.budgets(at_most)}
     with common.bar("planning") as progress:
         schedule = plans.plan(source, control, **options, progress=progress)
     network = schedule.network

@@ -32,6 +32,7 @@ def plan(
     min_service: ArrayLike | None = None,
     seed: int | None = None,
     smooth: bool | None = None,
+    gap: float | None = None,
     aim: Aim = CIRCULARITY,
     at_most: Mapping[str, float] | None = None,
     progress: Callable[[float], None] = lambda share: None,
@@ -53,6 +54,8 @@ def plan(
         smooth: whether a plan of ``optimum`` is the one nearest to business as usual, with the least change from
             interval to interval, among those of the same λ̄ and services (``optimum.smooth``); None: unless the
             network is large. Of other controllers, and where nothing is proved, plans stay as they are.
+        gap: to the bound, relative to it, that is enough for a plan of ``optimum`` beside ``min_service``; for it
+            tighter bounds are proved (``close_gap``). None: one bound, and the best plan that is found.
         aim: of ``mpc`` and ``optimum``: ``circularity``, the account to keep as low as can be beside ``min_service``,
             or weights of these; see ``bound``.
         at_most: of these: budgets, the highest total of accounts by id, in their units; see ``bound``.
@@ -68,7 +71,9 @@ def plan(
     """
     if smooth is not None and control != "optimum":
         raise CirlError("--smooth and --no-smooth go with --control optimum")
-    options = {"min_service": min_service, "smooth": smooth, "aim": aim, "at_most": at_most}
+    if gap is not None and (control != "optimum" or min_service is None):
+        raise CirlError("--gap goes with --control optimum and --min-service")
+    options = {"min_service": min_service, "smooth": smooth, "gap": gap, "aim": aim, "at_most": at_most}
     env, controller = _environment_and_controller(source, control, scenario, options)
     table = schedule(env, controller, seed=seed, progress=progress)
     name = type(control).__name__ if isinstance(control, Controller) else control or ""

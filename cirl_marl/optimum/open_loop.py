@@ -10,14 +10,17 @@ from numpy.typing import ArrayLike
 
 from cirl_marl.controllers.basic import Arrays, Planner
 from cirl_marl.environments.vector import MultiAgentVectorEnv
+from cirl_marl.errors import CirlError
 from cirl_marl.network import Network
 from cirl_marl.network.elements import CIRCULARITY
 from cirl_marl.network.uncertainty import expected_network
 from cirl_marl.optimum.admissible import NoCertificate
 from cirl_marl.optimum.aims import Aim
 from cirl_marl.optimum.bounds import Bound, bound
+from cirl_marl.optimum.closing import close_gap
 from cirl_marl.optimum.cross_entropy import KNOTS, Incumbent, search_each
 from cirl_marl.optimum.improve import improve_plan
+from cirl_marl.optimum.options import check_margin
 from cirl_marl.optimum.planned_episodes import Plan, starting_states
 from cirl_marl.optimum.smooth import MOST_ROWS, program_rows, smooth_plan
 
@@ -43,6 +46,7 @@ class Optimum(Planner):
         aim: Aim = CIRCULARITY,
         at_most: Mapping[str, float] | None = None,
         smooth: bool | None = False,
+        gap: float | None = None,
     ) -> None:
         """Choose the objective; see ``bound``.
 
@@ -52,7 +56,17 @@ class Optimum(Planner):
             aim: likewise.
             at_most: likewise.
             smooth: whether ``smooth_plan`` has the last word; None: where ``program_rows`` is at most MOST_ROWS.
+            gap: to the bound that is enough (``close_gap``), beside a demanded service; None: one program is solved,
+                and its plan improved as far as it can be.
+
+        Raises:
+            CirlError: for a gap that is not positive, or beside a weight of services.
         """
+        if gap is not None:
+            check_margin(gap, "gap")
+            if service_weight is not None:
+                raise CirlError(f"gap {gap:g} is to a bound with a demanded service: give min_service")
+        self._gap = gap
         self._min_service, self._service_weight, self._smooth = min_service, service_weight, smooth
         self._aims: dict[str, Any] = {"aim": aim, "at_most": at_most}
         self.plans: list[Bound] | list[Incumbent] = []
@@ -76,8 +90,8 @@ class Optimum(Planner):
             smooth = is_small if self._smooth is None else self._smooth
             self.plans, self.note = self._bound_plans(env, network, smooth, progress), "; ".join(notes)
         except NoCertificate as reason:
-            if self._aims["aim"] != CIRCULARITY or self._aims["at_most"]:
-                raise  # what is searched for is λ̄
+            if self._gap is not None or self._aims["aim"] != CIRCULARITY or self._aims["at_most"]:
+                raise  # what is searched for is λ̄, and proves nothing
             self.plans = self._search_plans(env, progress)
             self.note = f"best plan found, no certificate: {reason}"
         self._plan = Plan(self.plans)
@@ -101,11 +115,14 @@ class Optimum(Planner):
                 plans.append(by_start[key])
                 report(1.0)
                 continue
-            service, weight = self._min_service, self._service_weight
-            options = {"min_service": service, "service_weight": weight, "agents": env.agents or None, **self._aims}
-            solution = bound(network, start, **options)
-            report(0.0)
-            plan = improve_plan(solution, progress=report)
+            options = {"min_service": self._min_service, "agents": env.agents or None, **self._aims}
+            if self._gap is None:
+                solution = bound(network, start, service_weight=self._service_weight, **options)
+                report(0.0)
+                plan = improve_plan(solution, progress=report)
+            else:
+                plan = close_gap(network, within=self._gap, initial=start, **options).bound
+                report(1.0)
             plans.append(replace(smooth_plan(plan) if smooth else plan, network=env.network))
             by_start[key] = plans[-1]
         return plans

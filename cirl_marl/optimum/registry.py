@@ -41,6 +41,7 @@ def named_controller(
     constants: Mapping[str, float] | None = None,
     min_service: ArrayLike | None = None,
     smooth: bool | None = False,
+    gap: float | None = None,
     margin: float = 1.0,
     budget_margin: float = 1.0,
     futures: int | None = None,
@@ -56,6 +57,7 @@ def named_controller(
         min_service: mean level of every service, or of each, shape (services,), that PLANNERS plan for; None: as much
             as can be had.
         smooth: whether the plans of ``optimum`` are to change little; see ``Optimum``.
+        gap: that its plans may have to the bound; see ``Optimum``.
         margin: by what those of TUNABLE multiply what they aim at, or divide what may lack.
         budget_margin: by what ``mpc`` and ``scenario_mpc`` multiply what budgets of a disturbed episode cost.
         futures: that ``scenario_mpc`` plans for; None: FUTURES.
@@ -83,13 +85,15 @@ def named_controller(
         raise CirlError(f"an aim and budgets of accounts go with {', '.join(WITH_AIMS)} control, not with {name}")
     if has_aim and min_service is None:
         raise CirlError(f"aim {aim!r}: say which service is demanded beside it, as min_service, or it is least at none")
+    if gap is not None and name != "optimum":
+        raise CirlError(f"a gap to the bound goes with optimum control, not with {name}")
     if name == "optimum":
         from cirl_marl.optimum.mpc import SERVICE_FIRST
         from cirl_marl.optimum.open_loop import Optimum
 
         weight = SERVICE_FIRST if min_service is None else None
         options: dict[str, Any] = {"min_service": min_service, "service_weight": weight, "smooth": smooth}
-        return Optimum(aim=aim, at_most=at_most, **options)
+        return Optimum(aim=aim, at_most=at_most, gap=gap, **options)
     if name in PLANNERS:
         return _planner(
             name, min_service, margin, futures, prices, {"aim": aim, "at_most": at_most, "budget_margin": budget_margin}
