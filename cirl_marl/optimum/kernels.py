@@ -6,6 +6,7 @@ Theorem 4 of docs/bound.md has the notation; here a piece has length 1, and σ =
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 from scipy.linalg import expm
@@ -185,12 +186,14 @@ def _derivatives(degree: int, j: int) -> Floats:
     return derivatives
 
 
+@cache
 def _to_bernstein(degree: int) -> Floats:
     """Return what turns coefficients of powers into those of B_j, shape (d + 1, d + 1)."""
     orders = range(degree + 1)
     return np.array([[math.comb(j, m) / math.comb(degree, m) for j in orders] for m in orders])
 
 
+@cache
 def _within(degree: int, part: int, count: int) -> Floats:
     """Return what turns coefficients of B_j on [0, 1] into those of degree ``TERMS`` on one of equal parts of it."""
     powers_of = np.zeros((degree + 1, TERMS + 1))
