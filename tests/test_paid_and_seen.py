@@ -10,7 +10,19 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from cirl_marl import Arc, Control, ControlKind, Episode, Law, MultiAgentVectorEnv, Network, Node, Role, Service
+from cirl_marl import (
+    Arc,
+    Control,
+    ControlKind,
+    Episode,
+    Law,
+    MultiAgentVectorEnv,
+    Network,
+    NetworkError,
+    Node,
+    Role,
+    Service,
+)
 from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, Streams
 
 VALVE = Control(kind=ControlKind.RATE, low=0.0, neutral=1.0, high=2.0)
@@ -75,6 +87,18 @@ def test_an_arc_sees_both_its_ends() -> None:
     stock = env.physical.stock[:2, 0]
     expected = [outcome.flow[1, 0] / 4.0, stock[0] / 9.0, stock[1] / 2.0, 0.25]
     np.testing.assert_allclose(outcome.observation[:, 0], expected, rtol=1e-6)
+
+
+def test_a_countdown_tells_the_last_intervals_apart() -> None:
+    """It is 1/(intervals left), and stands after the time; who does not ask for it sees what was seen before."""
+    network = SHIPPED.with_options(observation={"mode": "local", "countdown": True}, episode={"horizon": 3})
+    env = MultiAgentVectorEnv(network, num_envs=2, agents=["belt"])
+    first = env.reset(0)["belt"]
+    assert env.observation_names["belt"][-2:] == ("time", "countdown")
+    seen = [first[0, -1], *(env.advance(np.zeros((1, 2))).observation[-1, 0] for _ in range(2))]
+    np.testing.assert_allclose(seen, [1 / 3, 1 / 2, 1.0], rtol=1e-6)
+    with pytest.raises(NetworkError, match="mode 'stocks' shows nothing else, so no countdown"):
+        network.with_options(observation={"mode": "stocks", "nodes": ("mine",)})
 
 
 def test_a_delivery_is_seen_as_a_mass() -> None:

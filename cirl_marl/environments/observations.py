@@ -19,17 +19,19 @@ from cirl_marl.network.rowsum import NEGLIGIBLE, RowSum, spans
 
 
 class Signals:
-    """Rows of the signal table: quantities, time, service levels, set-points of nodes and arcs, disturbances.
+    """Rows of the signal table: quantities, time, countdown, service levels, set-points, disturbances.
 
     The quantities are stocks, throughputs of nodes without stock, flows, inner states, measures, masses on the way
     along batch arcs, and of each substance the mass in stocks, throughputs and flows. All but inner states and
     measures, and the set-points, are divided by the scale of their compartment (what a batch arc delivers in a control
-    interval too), time by the horizon. Of substances the contents are seen, divided by the scale of the substance.
+    interval too), time by the horizon. The countdown, 1/(intervals left), tells the last apart, as time hardly does.
+    Of substances the contents are seen, divided by the scale of the substance.
 
     Attributes:
         quantities: number of quantities.
         contents: rows of each substance, in nodes and in flows.
         time: row of the time.
+        countdown: row of the countdown.
         rows: number of rows.
         sights: what disturbances show, the last rows.
     """
@@ -40,15 +42,16 @@ class Signals:
         arcs, lines, services = len(network.arcs), len(dynamics.batches.lines), len(network.services)
         places = nodes + arcs
         counts = (nodes, arcs, len(inner.names), len(inner.measure_names), lines, len(network.substances) * places)
-        parts = spans((*counts, 1, services, places))
+        parts = spans((*counts, 1, 1, services, places))
         self.nodes, self.flows, self.states, self.measures, self.loads, self.substances, *rest = parts
-        time, self.levels, self.set_points = rest
+        time, countdown, self.levels, self.set_points = rest
         firsts = range(self.substances.start, self.substances.stop, places)
         self.contents = [range(first, first + places) for first in firsts]
         self.stocks, self.throughputs = slice(0, len(network.stores)), slice(len(network.stores), nodes)
         self.sights = Sights(network.processes)
         self.seen = slice(self.set_points.stop, self.set_points.stop + len(self.sights.names))
-        self.quantities, self.time, self.rows = self.substances.stop, time.start, self.seen.stop
+        self.quantities, self.rows = self.substances.stop, self.seen.stop
+        self.time, self.countdown = time.start, countdown.start
         self.inside = self.loads.stop > self.flows.stop  # whether there are quantities inside compartments
 
 
@@ -208,6 +211,8 @@ class ObservationLayout:
         with np.errstate(over="ignore"):
             np.multiply(quantities, self._inverse_scale, out=table[: self.signals.quantities], casting="same_kind")
         table[self.signals.time] = time
+        if self._network.observation.countdown:
+            table[self.signals.countdown] = 1.0 / np.maximum(self._network.episode.horizon * (1.0 - time), 1.0)
         table[self.signals.levels] = levels
         if sight is not None:
             table[self.signals.seen] = sight
@@ -287,6 +292,8 @@ class ObservationLayout:
             if not agents or agent in agents:
                 yield from (signals.seen.start + row for row in rows)
         yield signals.time
+        if network.observation.countdown:
+            yield signals.countdown
 
     def _arrivals(self, node: int) -> Iterator[int]:
         """Nodes into which one of fixed lifetime, such as a transport, releases: who orders ahead sees what for."""
@@ -308,7 +315,7 @@ class ObservationLayout:
         yield from states
         yield from (f"mass on {arc}" for arc in self._load)
         yield from (f"{part.id} in {id_}" for part in network.substances for id_ in network.compartments)
-        yield "time"
+        yield from ("time", "countdown")
         yield from (f"service level of {service.id}" for service in network.services)
         yield from (f"set-point of {id_}" for id_ in network.compartments)
         yield from self.sights.names

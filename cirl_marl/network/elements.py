@@ -619,3 +619,6 @@ class Observation(CheckedRecord):
         tuple[str, ...],
         Declaration("in mode ``stocks``, the observed stocks (ids of nodes) and inner states (``compartment.state``)"),
     ] = ()
+    countdown: Annotated[
+        bool, Declaration("whether agents also see 1/(intervals left), which tells the last ones apart, in other modes")
+    ] = False
