@@ -17,7 +17,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
@@ -38,7 +38,6 @@ from cirl_marl.definitions.writer import fingerprint
 from cirl_marl.evaluation.calibration import Calibration, calibrate
 from cirl_marl.evaluation.statistics import Aggregate, over_episodes, worst_mean
 from cirl_marl.network import Floats
-from cirl_marl.network.elements import Observe
 from cirl_marl.optimum.draw_proofs import Sampling
 from cirl_marl.optimum.draws import Prices
 from cirl_marl.optimum.mpc import MPC
@@ -64,16 +63,17 @@ NEVER = -1
 LATE = {"at once": 0, "an interval late": 1, "four intervals late": 4, "never": NEVER}
 """How late disturbances are seen, in intervals, by name; stocks always are."""
 DELAYED = [*LATE][1:]
-SIGHT: Mapping[str, tuple[Observe, Mapping[str, Any]]] = {
-    "local": ("local", {}),
-    "neighbours": ("neighbours", {}),
-    "all stocks": ("full", {}),
-    "late": ("local", {"delayed": 1}),
-    "never": ("local", {"observed": "none"}),
-    "forecasts of 1": ("local", {"forecast": 1}),
-    "of 4": ("local", {"forecast": 4}),
+SIGHT: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Any]]] = {
+    "local": ({"mode": "local"}, {}),
+    "neighbours": ({"mode": "neighbours"}, {}),
+    "all stocks": ({"mode": "full"}, {}),
+    "countdown": ({"mode": "local", "countdown": True}, {}),
+    "late": ({"mode": "local"}, {"delayed": 1}),
+    "never": ({"mode": "local"}, {"observed": "none"}),
+    "forecasts of 1": ({"mode": "local"}, {"forecast": 1}),
+    "of 4": ({"mode": "local"}, {"forecast": 4}),
 }
-"""What learners see, by name: the observation mode, and what is seen of every disturbance; the first is compared to."""
+"""What learners see, by name: how they observe, and what is seen of every disturbance; the first is compared to."""
 BY_DRAW, PRICES = (
     ("values", "informed_values", "luck", "informed_luck", "gross_mass"),
     ("prices", "informed_prices"),
@@ -133,8 +133,8 @@ class Alternating(Controller):
 
 def seen_by(network: Network, sight: str) -> Network:
     """Return a network in which agents see what ``SIGHT`` says."""
-    mode, seen = SIGHT[sight]
-    network = network.with_options(observation={"mode": mode})
+    observation, seen = SIGHT[sight]
+    network = network.with_options(observation=observation)
     if not seen:
         return network
     seen = {"observed": "now", "delayed": 0, "forecast": 0, **seen}
@@ -300,10 +300,12 @@ def information(world: World, found: UncertainBound, tune: int, episodes: int) -
     return {"draws": episodes, "seen": figures}
 
 
-def value_of_sight(world: World, found: UncertainBound, recipe: str, seeds: int, steps: int | None) -> dict[str, Any]:
+def value_of_sight(
+    world: World, found: UncertainBound, recipe: str, seeds: int, steps: int | None, sights: Collection[str]
+) -> dict[str, Any]:
     """Return the gaps of what a recipe learns from each of some ``seeds``, by what it sees, and what that gains."""
     figures, gaps = dict[str, Any](), dict[str, Floats]()
-    for sight in SIGHT:
+    for sight in sights:
         network, means, levels = seen_by(found.network, sight), list[float](), list[float]()
         for seed in range(1, seeds + 1):
             (team,) = learners(recipe, network, sight, [seed], steps)
@@ -327,7 +329,7 @@ def sight_table(results: Mapping[str, Any]) -> str:
     for world, entry in entries(results):
         if "sight" in entry:
             seen = entry["sight"]["seen"]
-            changes = (_percent(seen[name]["change"], signed=True) for name in others)
+            changes = (_percent(seen[name]["change"], signed=True) if name in seen else "" for name in others)
             level = f"{min(figures['level'] for figures in seen.values()):.4f}"
             rows.append(
                 (f"`{world.network}`", _percent(seen["local"]["gap"]), *changes, level, str(entry["sight"]["seeds"]))
@@ -411,7 +413,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("networks", nargs="*", metavar="NETWORK", help="default: all")
     parser.add_argument("--table", action="store_true", help="measure nothing")
-    parser.add_argument("--only", default=",".join((*CONTENDERS, *LEARNERS)), help="contenders; default: all")
+    everything = ",".join((*CONTENDERS, *LEARNERS, *SIGHT))
+    parser.add_argument("--only", default=everything, help="contenders, or what learners see; default: all")
     parser.add_argument("--information", action="store_true", help="of MPC, instead")
     parser.add_argument("--sight", action="store_true", help="what learners gain from it, instead")
     parser.add_argument("--draws", type=int, default=200, help="of which the bound is the mean")
@@ -432,13 +435,17 @@ def main() -> None:
             write_json(RESULTS, results)
             continue
         if options.sight:
-            gained = value_of_sight(world, found, LEARNERS[0], options.seeds, options.steps)
+            sights = [name for name in SIGHT if name in ("local", *options.only.split(","))]
+            gained = value_of_sight(world, found, LEARNERS[0], options.seeds, options.steps, sights)
             results = json.loads(RESULTS.read_text())
+            known = results[world.network].get("sight", gained)
+            if known["seen"]["local"] == gained["seen"]["local"]:  # the same learners: others are compared to them, too
+                gained["seen"] = known["seen"] | gained["seen"]
             results[world.network]["sight"] = gained
             write_json(RESULTS, results)
             continue
         for name in options.only.split(","):
-            if SMALL.get(name, world.network) != world.network:
+            if name in SIGHT or SMALL.get(name, world.network) != world.network:
                 continue
             episodes = min(options.episodes, options.draws) if name in PLANNERS else options.draws
             seen, tune, margin = found, options.tune, 1.0
