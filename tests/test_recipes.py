@@ -233,6 +233,16 @@ def test_exact_gradients_magnify_nothing_that_hardly_varied() -> None:
         ),
         (
             '"PPO"\nparameters = { n_steps = 8',
+            '"ARS"\nparameters = { n_delta = "x", n_top = 9',
+            "parameters.n_delta: ARS needs int of at least 1, got 'x'",
+        ),
+        (
+            '"PPO"\nparameters = { n_steps = 8',
+            '"TQC"\nparameters = { top_quantiles_to_drop_per_net = 5, policy_kwargs = "x"',
+            "parameters.policy_kwargs: TQC needs dict",
+        ),
+        (
+            '"PPO"\nparameters = { n_steps = 8',
             '"TQC"\nparameters = { top_quantiles_to_drop_per_net = 5, policy_kwargs = { n_quantiles = 5 }',
             "parameters.top_quantiles_to_drop_per_net: TQC has no more than 4, got 5",
         ),

@@ -133,10 +133,15 @@ def parameter_mistakes(name: str, parameters: Mapping[str, Any]) -> Iterator[str
             for part, kind in value.items():
                 if isinstance(kind, str) and part.endswith(("_class", "_fn")):
                     yield f"{place}.{part}: is a class, which only Python can give, not a text, got {kind!r}"
-    quantiles = (parameters.get("policy_kwargs") or {}).get("n_quantiles", 25) if name == "TQC" else 0
-    for part, most in (("n_top", parameters.get("n_delta", 8)), ("top_quantiles_to_drop_per_net", quantiles - 1)):
-        if part in signature and isinstance(number := parameters.get(part), int) and number > most:
-            yield f"parameters.{part}: {name} has no more than {most}, got {number}"
+    kwargs = parameters.get("policy_kwargs")
+    quantiles = kwargs.get("n_quantiles", 25) if isinstance(kwargs, Mapping) else 25
+    for part, whole, spare in (
+        ("n_top", parameters.get("n_delta", 8), 0),
+        ("top_quantiles_to_drop_per_net", quantiles, 1),
+    ):
+        number = parameters.get(part)
+        if part in signature and isinstance(number, int) and isinstance(whole, int) and number > whole - spare:
+            yield f"parameters.{part}: {name} has no more than {whole - spare}, got {number}"
 
 
 def _is_infinite(value: object) -> bool:
