@@ -100,13 +100,13 @@ def calibrate(
     copies, tries = env(draws), list[tuple[float, float, Calibration]]()
     searches, budget_margin, budget_step = [_MarginSearch() for _ in demand], 1.0, FIRST_STEP
     for done in range(TRIES):
-        own = [search.margin for search in searches]
-        margins = Calibration(own[0] if len({*own}) == 1 else tuple(own), 0.0, draws, budget_margin)
+        values = tuple(search.margin for search in searches)
+        margins = Calibration(values[0] if len({*values}) == 1 else values, 0.0, draws, budget_margin)
         run = rollout(copies, controller(**margins.margins), seed=FIRST_DRAW)
         over = (aims.bookings(run).mean(axis=0) - aims.limits) / aims.sizes
         overrun, excess = float(over[~aims.by_year].max(initial=0.0)), run.episode_levels.mean(axis=0) - demand
-        tried = replace(margins, excess=float(excess.min()), overrun=overrun)
-        tries.append((max(CLOSE / 2, tried.miss), float(np.abs(excess).sum()), tried))
+        outcome = replace(margins, excess=float(excess.min()), overrun=overrun)
+        tries.append((max(CLOSE / 2, outcome.miss), float(np.abs(excess).sum()), outcome))
         progress((done + 1) / TRIES)
         if overrun > CLOSE / 2:  # levels of before were at other multipliers
             budget_margin *= 1.0 + max(budget_step, 2.0 * overrun)
@@ -115,7 +115,7 @@ def calibrate(
         if overrun <= CLOSE / 2 and not any(moves):
             break
     progress(1.0)
-    return min(tries, key=lambda rated: rated[:2])[-1]
+    return min(tries, key=lambda attempt: attempt[:2])[-1]
 
 
 class _MarginSearch:
@@ -136,20 +136,23 @@ class _MarginSearch:
         if abs(excess) <= CLOSE / 2:
             self._is_settled = True
             return False
-        last, is_much, other = self.margin, excess > 0, self._ends.get(excess < 0)
-        if other is not None:
-            self._run = max(self._run, 0) + 1 if is_much else min(self._run, 0) - 1
-        is_stale = other is not None and (abs(self._run) == OUTDATED or (other[0] < last) != is_much)
+        margin, is_surplus, end = self.margin, excess > 0, self._ends.get(excess < 0)
+        if end is not None:
+            self._run = max(self._run, 0) + 1 if is_surplus else min(self._run, 0) - 1
+        is_stale = end is not None and (abs(self._run) == OUTDATED or (end[0] < margin) != is_surplus)
         if self._is_settled or is_stale:
             self._ends, self._step, self._run = {}, FIRST_STEP, 0
-        self._ends[is_much] = last, excess
+        self._ends[is_surplus] = margin, excess
         if len(self._ends) == 2:
             (low, lack), (high, surplus) = self._ends[False], self._ends[True]
             self.margin = low * (high / low) ** float(np.clip(lack / (lack - surplus), 0.15, 0.85))
         else:
             change = 1.0 + max(self._step, 2.0 * abs(excess))
-            self.margin, self._step = max(LIMITS[0], last / change) if is_much else last * change, 3.0 * self._step
-        self._is_settled = self.margin == last or self.margin >= LIMITS[1]
+            self.margin, self._step = (
+                max(LIMITS[0], margin / change) if is_surplus else margin * change,
+                3.0 * self._step,
+            )
+        self._is_settled = self.margin == margin or self.margin >= LIMITS[1]
         if self._is_settled:
-            self.margin = last
+            self.margin = margin
         return not self._is_settled

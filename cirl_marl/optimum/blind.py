@@ -121,10 +121,10 @@ class BestConstant(Planner):
         if not self._results or self._results[0][0] is not env.network:
             self._results[:] = [(env.network, {})]
         by_margin, margins = self._results[0][1], env.network.by_service("margin", self._margin, "a margin")
-        if (own := tuple(margins.tolist())) not in by_margin:
-            nearest = min(by_margin, key=lambda other: np.abs(other - margins).max(initial=0.0), default=None)
-            by_margin[own] = self._best(env, None if nearest is None else by_margin[nearest], progress)
-        self.actions = by_margin[own]
+        if (key := tuple(margins.tolist())) not in by_margin:
+            nearest = min(by_margin, key=lambda place: np.abs(place - margins).max(initial=0.0), default=None)
+            by_margin[key] = self._best(env, None if nearest is None else by_margin[nearest], progress)
+        self.actions = by_margin[key]
         self._replay = Replay(self.actions)
         self._replay.start(env, seed)
 

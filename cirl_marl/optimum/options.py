@@ -138,7 +138,7 @@ def with_margin(network: Network, margin: ArrayLike) -> Network:
     if (margins == 1.0).all():
         return network
     services = (
-        replace(s, low=product(s.low, own), high=product(s.high, 1.0 / own if s.substance else own))
-        for s, own in zip(network.services, margins.tolist(), strict=True)
+        replace(s, low=product(s.low, factor), high=product(s.high, 1.0 / factor if s.substance else factor))
+        for s, factor in zip(network.services, margins.tolist(), strict=True)
     )
     return network.variant(services=tuple(services))

@@ -208,7 +208,8 @@ def _margins_text(calibration: Calibration, network: Network) -> str:
     """Return the margins, and that on budgets where they are dearer."""
     budgets, margin = calibration.budget_margin, calibration.margin
     if isinstance(margin, tuple):
-        text = ", ".join(f"{own:.4g} of '{service.id}'" for service, own in zip(network.services, margin, strict=True))
+        parts = zip(network.services, margin, strict=True)
+        text = ", ".join(f"{factor:.4g} of '{service.id}'" for service, factor in parts)
     else:
         text = f"{margin:.4g}"
     return text + (f" (of budgets {budgets:.4g})" if budgets != 1.0 else "")
