@@ -90,6 +90,7 @@ class MultiAgentVectorEnv:
         agents: Sequence[str] | None = None,
         reward: str | None = None,
         observe: str | None = None,
+        countdown: bool | None = None,
         circularity: str = "end",
         circularity_weight: float | None = None,
         charges: Mapping[str, float] | None = None,
@@ -105,6 +106,7 @@ class MultiAgentVectorEnv:
             agents: who acts; the others hold their neutral control. None: the network's own choice.
             reward: reward mode; None takes the scenario's own, which is ``mixed`` unless the definition says otherwise.
             observe: ``local``, ``neighbours``, ``full`` or ``model``; None takes the scenario's own.
+            countdown: whether agents also see 1/(intervals left), and so the end; None takes the scenario's own.
             circularity: whether the team reward is λ at the ``end`` of the interval or its ``mean`` over it.
             circularity_weight: w in [0, 1], weight of λ in the reward; None takes the definition's.
             charges: what a unit of each account costs in rewards with λ, mass; see ``Credit``.
@@ -140,7 +142,7 @@ class MultiAgentVectorEnv:
         self.actuators = Actuators(variant, agents, num_envs, self.dynamics.factors.ranges)
         self.agents = self.actuators.agents
         self.action_spaces = self.actuators.spaces
-        self.layout = ObservationLayout(self.dynamics, self.agents, observe, num_envs)
+        self.layout = ObservationLayout(self.dynamics, self.agents, observe, num_envs, countdown)
         self.ledger = Ledger(variant, self.dynamics.factors.ranges)
         self.scoring = Scoring(self.dynamics, self.layout, self.agents, num_envs)
         self.idle = self.supply.idle(self.agents)

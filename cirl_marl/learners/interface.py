@@ -81,8 +81,8 @@ def train(
         report: called after every joint step.
         device: where stacked learners compute, as torch names it.
         checkpoint_every: seconds after which a checkpoint is written; None is a minute, 0 never.
-        **options: ``scenario``, ``reward``, ``observe``, ``circularity``, ``circularity_weight``, ``horizon``,
-            ``uncertain``; they override the recipe's.
+        **options: ``scenario``, ``reward``, ``observe``, ``countdown``, ``circularity``, ``circularity_weight``,
+            ``horizon``, ``uncertain``; they override the recipe's.
 
     Returns:
         The finished training; ``learners[name].model`` is the Stable-Baselines3 model.
@@ -173,7 +173,9 @@ def _first_trainings(training: Training) -> Iterator[tuple[list[str], Training]]
     """Yield each recipe with which learners begin, to be trained in the same network and with the same seed."""
     env, config = training.env, training.config
     recipes = {name: (start.recipe, start.steps) for name, start in training.starts.items() if start.recipe}
-    options = {key: config.options[key] for key in ("observe", "horizon", "uncertain") if key in config.options}
+    options = {
+        key: config.options[key] for key in ("observe", "countdown", "horizon", "uncertain") if key in config.options
+    }
     for recipe, steps in dict.fromkeys(recipes.values()):
         names = [name for name, key in recipes.items() if key == (recipe, steps)]
         yield names, prepare(env.network, recipe, steps=steps, seed=config.seed, agents=env.agents, **options)
