@@ -222,6 +222,10 @@ class ObservationLayout:
         observation: NDArray[Any] = table.take(self._index, axis=0)
         return observation
 
+    def by_agent(self, observation: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        """Split a stacked observation, shape (entries of all agents, B), into agent → (B, entries)."""
+        return {agent: observation[rows].T for agent, rows in self.slices.items()}
+
     def contents(self, quantities: Floats) -> Floats:
         """Return the part of each substance in nodes and flows, 0 where there is nothing, in rows of ``substances``."""
         masses = quantities[self.signals.substances]

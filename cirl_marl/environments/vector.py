@@ -516,7 +516,7 @@ class MultiAgentVectorEnv:
 
     def by_agent(self, observation: NDArray[np.float32]) -> Observations:
         """Split a stacked observation, shape (entries of all agents, B), into agent → (B, entries)."""
-        return {agent: observation[rows].T for agent, rows in self.layout.slices.items()}
+        return self.layout.by_agent(observation)
 
     def _report_ends(self, infos: Infos, outcome: Outcome) -> None:
         """Add what infos say of the copies whose episode ended."""
@@ -598,15 +598,19 @@ class MultiAgentVectorEnv:
         stocks = self.rows.stocks(state.stock)
         return np.concatenate([stocks, through, state.flow, state.inner, state.measures, loads, substances])
 
-    def stacked_observation(self, table: Floats | None = None) -> NDArray[Any]:
-        """Return the present observations, shape (entries of all agents, B), by way of a ``table`` of ``layout``."""
+    def stacked_observation(self, table: Floats | None = None, layout: ObservationLayout | None = None) -> NDArray[Any]:
+        """Return the present observations, shape (entries of all agents, B), by way of a ``table`` of the ``layout``.
+
+        None is that of the environment.
+        """
+        layout = self.layout if layout is None else layout
         state = self.physical
         quantities = self.quantities(state)
         time = state.step / self.network.episode.horizon
         done = np.maximum(state.step - 1, 0)
         factors = self.dynamics.factors(state.factors, state.disturbances, done)
         levels = self.scoring.levels(quantities, done, factors)
-        return self.layout.observe(quantities, time, levels, self._sight(state), table)
+        return layout.observe(quantities, time, levels, self._sight(state), table)
 
     def _sight(self, state: State) -> Floats | None:
         """Return what the disturbances show of themselves, in the rows of ``layout.sights``; None if nothing."""

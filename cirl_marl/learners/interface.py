@@ -19,9 +19,11 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
+from cirl_marl.controllers.basic import Arrays
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.definitions.reader import write_network
 from cirl_marl.dynamics.adjoint import derivative_obstacle
+from cirl_marl.environments.observations import ObservationLayout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RecipeError, RunError, real_number, unknown_name, whole_number
 from cirl_marl.learners.agent_env import AgentVecEnv
@@ -402,7 +404,8 @@ def export(run: str | Path | RunDirectory, folder: str | Path) -> list[Path]:
 class Trained(Policies):
     """Acts by the policies of the checkpoint that a run has chosen.
 
-    ``checkpoint`` is the folder from which they were loaded; a run that is being trained has others later.
+    Each sees what it learnt from, whatever the environment shows. ``checkpoint`` is the folder from which they were
+    loaded; a run that is being trained has others later.
     """
 
     def __init__(self, run: str | Path | RunDirectory) -> None:
@@ -416,15 +419,22 @@ class Trained(Policies):
         super().__init__(policies)
 
     def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
-        """Forget the last episode; a ``RunError`` if ``env`` has other agents, or shows them something else."""
+        """Forget the last episode; a ``RunError`` if ``env`` has other agents, or not what they learnt from."""
         if set(env.agents) != set(self._names):
             raise RunError(f"{self.run.path}: trained {sorted(self._names)}, not {sorted(env.agents)}")
+        self._env, self._layout = env, env.layout
+        if env.layout.names != self._names:
+            seen = {key: self.run.config.options.get(key) for key in ("observe", "countdown")}
+            self._layout = ObservationLayout(env.dynamics, env.agents, seen["observe"], env.num_envs, seen["countdown"])
         for agent, entries in self._names.items():
-            if (shown_here := env.layout.names[agent]) != entries:
-                counts = f"{len(shown_here)} entries, not {len(entries)}"
-                difference = next((name for name in shown_here if name not in entries), counts)
-                raise RunError(
-                    f"{self.run.path}: '{agent}' learnt from other observations than this environment's "
-                    f"({difference}); make the environment with the options of the run, as its make_env() does"
-                )
+            if (seen_here := self._layout.names[agent]) != entries:
+                counts = f"{len(seen_here)} entries, not {len(entries)}"
+                difference = next((name for name in seen_here if name not in entries), counts)
+                raise RunError(f"{self.run.path}: '{agent}' learnt from other observations ({difference})")
         super().start(env, seed)
+
+    def act(self, observations: Arrays) -> Arrays:
+        """Return each policy's deterministic action, which depends on what its agents learnt from alone."""
+        if self._layout is not self._env.layout:
+            observations = self._layout.by_agent(self._env.stacked_observation(layout=self._layout))
+        return super().act(observations)
