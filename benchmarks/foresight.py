@@ -68,7 +68,6 @@ SIGHT: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Any]]] = {
     "local": ({"mode": "local"}, {}),
     "neighbours": ({"mode": "neighbours"}, {}),
     "all stocks": ({"mode": "full"}, {}),
-    "countdown": ({"mode": "local", "countdown": True}, {}),
     "late": ({"mode": "local"}, {"delayed": 1}),
     "never": ({"mode": "local"}, {"observed": "none"}),
     "forecasts of 1": ({"mode": "local"}, {"forecast": 1}),
