@@ -14,6 +14,7 @@ from cirl_marl.dynamics.components import ComponentNetwork
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.compartment_model import Bools
 from cirl_marl.network.rowsum import NEGLIGIBLE, RowSum
 
 KEPT = 1.0 - 1e-12
@@ -80,6 +81,9 @@ class ScheduledFlows:
     A donor with stock x, proportional exits a and a constant outflow U obeys ẋ ≥ −a·x − U, which stays non-negative for
     a substep h if U ≤ x·a/(e^{ah} − 1). Flows from one donor are cut by the same factor, and so are all components of
     a source whose contents change.
+
+    Attributes:
+        arcs: those whose flows it cuts.
     """
 
     def __init__(self, laws: FlowLaws, substep: float) -> None:
@@ -91,17 +95,17 @@ class ScheduledFlows:
         # what comes out of slots is of the component that is in them
         lines = {network.arc_index[arc] for arc in network.lines.values()} if isinstance(network, StagedNetwork) else ()
         orders = [k for k in np.flatnonzero(laws.is_scheduled).tolist() if k < arcs or k in lines or k in of_sources]
-        self._arcs: Integers = np.array(orders, dtype=np.intp)
-        self._donors, place = np.unique(network.donors[self._arcs], return_inverse=True)
+        self.arcs: Integers = np.array(orders, dtype=np.intp)
+        self._donors, place = np.unique(network.donors[self.arcs], return_inverse=True)
         self._slot: Integers = place
         slot = {int(node): i for i, node in enumerate(self._donors)}
         self._together = np.searchsorted(self._donors, laws.source_contents.donors)
         proportional = laws.driver == network.donors
         exits = [k for k, d in enumerate(network.donors) if int(d) in slot and proportional[k]]
         exit_slot = [len(slot) + slot[int(network.donors[k])] for k in exits]
-        rows, columns = [*self._slot, *exit_slot], [*self._arcs, *exits]
+        rows, columns = [*self._slot, *exit_slot], [*self.arcs, *exits]
         self._outflows = RowSum(rows, columns, 1.0, (2 * len(slot), len(network.arcs)))
-        self._sum = RowSum(self._slot, np.arange(len(self._arcs)), 1.0, (len(slot), len(self._arcs)))
+        self._sum = RowSum(self._slot, np.arange(len(self.arcs)), 1.0, (len(slot), len(self.arcs)))
         self._loads = None
         if components > 1:
             orders = [k for k in orders if k not in lines and k not in of_sources]
@@ -109,7 +113,7 @@ class ScheduledFlows:
 
     def cut(self, stock: Floats, rate: Floats) -> Floats:
         """Return the rates, shape (arcs, B), with those of scheduled flows cut; the same array if none is."""
-        if not len(self._arcs):
+        if not len(self.arcs):
             return rate
         available_stock = self._stocks(stock)
         rate = self._cut(available_stock, rate)
@@ -123,15 +127,23 @@ class ScheduledFlows:
         factor = np.divide(available, demand, out=np.ones_like(available_stock), where=demand > available)
         factor[self._together] = factor[self._together].min(axis=0)
         rate = rate.copy()
-        rate[self._arcs] *= factor.take(self._slot, axis=0)
+        rate[self.arcs] *= factor.take(self._slot, axis=0)
         return rate
+
+    def limits(self, stock: Floats, rate: Floats) -> tuple[Bools, Floats]:
+        """Return which of ``arcs`` are cut, and what each then is of its donor's stock, 1/time, shape (arcs, B)."""
+        demand, turned_over = self._demand(rate)
+        deliverable = _deliverable(turned_over) * KEPT
+        is_cut = demand > self._stocks(stock) * deliverable
+        part = np.divide(deliverable, demand, out=np.zeros_like(demand), where=is_cut)
+        return is_cut.take(self._slot, axis=0), rate[self.arcs] * part.take(self._slot, axis=0)
 
     def pull_back(self, stock: Floats, rate: Floats, adjoint: Floats, stock_adjoint: Floats) -> None:
         """Turn, in place, the adjoint of the rates that ``cut`` returned into that of those it was given.
 
         What comes by the stocks is added to theirs. A flow that just need not be cut counts as uncut.
         """
-        if not len(self._arcs):
+        if not len(self.arcs):
             return
         available_stock = self._stocks(stock)
         whole_adjoint = np.zeros_like(available_stock)
@@ -152,13 +164,13 @@ class ScheduledFlows:
         if not is_cut.any():
             return
         ratio = np.divide(1.0, demand, out=np.zeros_like(demand), where=is_cut)
-        factor, load = np.where(is_cut, available * ratio, 1.0), self._sum(adjoint[self._arcs] * rate[self._arcs])
+        factor, load = np.where(is_cut, available * ratio, 1.0), self._sum(adjoint[self.arcs] * rate[self.arcs])
         together = factor[self._together]
         factor[self._together] = together.min(axis=0)
         is_least = np.arange(len(together))[:, None, None] == together.argmin(axis=0)
         load[self._together] = np.where(is_least, load[self._together].sum(axis=0), 0.0)
         factor_adjoint = load * ratio
-        adjoint[self._arcs] *= factor.take(self._slot, axis=0)
+        adjoint[self.arcs] *= factor.take(self._slot, axis=0)
         whole_adjoint += factor_adjoint * deliverable * KEPT
         # d/dT of T/(e^T − 1), T what is turned over
         grown = np.expm1(turned_over)

@@ -57,6 +57,7 @@ class Supply:
     """The arcs of a network that make up for services.
 
     Attributes:
+        dynamics: of the network.
         arcs: their ids.
         of: service that each stands for, among those that arcs make up for, shape (arcs,).
         indices: position of each among the arcs of the network.
@@ -74,7 +75,7 @@ class Supply:
 
     def __init__(self, dynamics: Dynamics) -> None:
         """Compile the arcs of ``dynamics``."""
-        self._dynamics, network = dynamics, dynamics.network
+        self.dynamics, network = dynamics, dynamics.network
         made_up = [arc for arc in network.arcs if arc.makes_up_for]
         self.arcs = tuple(arc.id for arc in made_up)
         service_ids = list(dict.fromkeys(arc.makes_up_for for arc in made_up))
@@ -117,8 +118,8 @@ class Supply:
 
     def bounds(self, step: Integers, factors: Floats | None) -> tuple[Floats, Floats]:
         """Return the least and the most that each of ``arcs`` can supply in an interval of each copy, (arcs, B)."""
-        low = self.drawn(self._dynamics.control_low[self.rows].take(step, axis=1), factors)
-        return low, self._dynamics.capacity_in(step, factors)[self.rows]
+        low = self.drawn(self.dynamics.control_low[self.rows].take(step, axis=1), factors)
+        return low, self.dynamics.capacity_in(step, factors)[self.rows]
 
     def __call__(
         self,
@@ -155,9 +156,9 @@ class Supply:
             the controls with what the arcs supply, and what the interval did.
         """
         batch, is_idle = controls.shape[1], bool(idle.any())
-        block = max(1, CELLS // self._dynamics.rows.masses)
+        block = max(1, CELLS // self.dynamics.rows.masses)
         if not is_idle and batch <= block:
-            return controls, self._dynamics.advance(stock, inner, controls, step, factors)
+            return controls, self.dynamics.advance(stock, inner, controls, step, factors)
         idle, parts = np.broadcast_to(idle, (len(self.arcs), batch)), []
         for columns in (slice(first, first + block) for first in range(0, batch, block)):
             masses, states, others = (np.ascontiguousarray(array[:, columns]) for array in (stock, inner, controls))
@@ -166,7 +167,7 @@ class Supply:
             if is_idle:
                 parts.append(self._advance_block(*inputs, idle[:, columns], draws))
             else:
-                parts.append((others, self._dynamics.advance(*inputs, draws)))
+                parts.append((others, self.dynamics.advance(*inputs, draws)))
         if len(parts) == 1:
             return parts[0]
         arrays = zip(*([getattr(done, field.name) for field in fields(done)] for _, done in parts), strict=True)
@@ -189,7 +190,7 @@ class Supply:
         self, stock: Floats, inner: Floats, controls: Floats, step: Integers, idle: Bools, factors: Floats | None
     ) -> tuple[Floats, Transition]:
         """Do what ``advance`` does, for copies so few that all they take stays in a cache."""
-        dynamics, batch = self._dynamics, controls.shape[1]
+        dynamics, batch = self.dynamics, controls.shape[1]
         range_, all_controls = SupplyRange(self, step, idle, factors), controls.copy()
         demand = self.demand_factors(self.demand.take(step, axis=1), factors)
         supply, base, expected = np.zeros((3, *demand.shape))
@@ -263,7 +264,7 @@ class Supply:
                 part = gap[row, copy] / demand[row, copy] if demand[row, copy] else np.inf
                 arcs = ", ".join(arc for arc, of in zip(self.arcs, self.of.tolist(), strict=True) if of == row)
                 warnings.warn(
-                    f"network '{self._dynamics.network.name}': service '{self.services[row]}' is {part:.3g} of its "
+                    f"network '{self.dynamics.network.name}': service '{self.services[row]}' is {part:.3g} of its "
                     f"demand off in interval {step[copy]} of copy {copy}; "
                     f"{arcs} could make up for it, but corrections ran out",
                     RuntimeWarning,
@@ -294,7 +295,7 @@ class Supply:
         supply[place] += shift
         amounts = range_.amounts(range_.extents(supply)[self.of])
         controls[self.rows] = np.where(idle, amounts, controls[self.rows])
-        done = self._dynamics.advance(stock, inner, controls, step, factors)
+        done = self.dynamics.advance(stock, inner, controls, step, factors)
         change = self.quantities(done.stock, done.moved_mass) - base
         slope = np.divide(change, shift, out=np.zeros_like(change), where=shift != 0)
         return np.ascontiguousarray(slope.reshape(services, batch, services).transpose(1, 0, 2))
@@ -302,7 +303,7 @@ class Supply:
     def quantities(self, stock: Floats, moved_mass: Floats | None) -> Floats:
         """Return what the services measure at the end of an interval, shape (services, B)."""
         of_stocks, of_flows = self.measures
-        measured = of_stocks(self._dynamics.rows.stocks(stock))
+        measured = of_stocks(self.dynamics.rows.stocks(stock))
         return measured if moved_mass is None else of_flows.add_to(measured, moved_mass / self._interval)
 
 

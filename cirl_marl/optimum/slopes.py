@@ -1,21 +1,25 @@
 """How what intervals of an episode end with changes with their stocks and actions, to first order.
 
 Every interval is linear to first order around an episode, δx' = J_x δx + J_a δa, and so are mean flows. The Jacobians
-are difference quotients of the simulator, so that cuts of flows and supplies that make up for services are in them.
+are difference quotients of the simulator, or by stocks products of the matrices of its substeps (``IntervalMaps``), so
+that cuts of flows and supplies that make up for services are in them.
 Beside budgets such supplies are held in these, and change as actions do (``step_supplies``).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Annotated, Protocol
 
 import numpy as np
 
 from cirl_marl.dynamics.integrator import Dynamics
+from cirl_marl.dynamics.interval_maps import FollowingSupplies, IntervalMaps, has_interval_maps
 from cirl_marl.dynamics.supply import Supply
 from cirl_marl.environments.actuators import Actuators
-from cirl_marl.network import Floats
+from cirl_marl.network import Floats, Integers
+from cirl_marl.network.compartment_model import Bools
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.aims import Aims
 from cirl_marl.optimum.planned_episodes import HasPlan
@@ -73,35 +77,60 @@ class Slopes:
 
 def jacobians(plan: ActionPlan, dynamics: Dynamics, first: int = 0) -> Slopes:
     """Return the slopes of every interval from the first, around a plan."""
-    network = plan.network
-    steps, entries = plan.actions.shape
-    rows, nodes = dynamics.rows, dynamics.rows.nodes.stop
+    steps = len(plan.actions)
     stock = WindowSimulator(dynamics, plan.agents).run(plan.initial, plan.actions, first)[0]
-    actuators, interval = Actuators(network, plan.agents or None, steps), np.arange(first, first + steps)
+    actuators, interval = Actuators(plan.network, plan.agents or None, steps), np.arange(first, first + steps)
     controls = actuators.controls(np.ascontiguousarray(plan.actions.T), interval)
-    supply = Supply(dynamics)
+    masses, inner, supply = dynamics.extend(stock[:-1].T), np.empty((0, steps)), Supply(dynamics)
     idle, is_held = supply.idle(actuators.agents), bool(plan.aims.budgets)
-    supplies = IdleSupplies.of(dynamics, supply, idle & is_held, dynamics.extend(stock[:-1].T), controls, first)
+    supplies = IdleSupplies.of(dynamics, supply, idle & is_held, masses, controls, first)
+    follows = idle & (not is_held)
+    if not has_interval_maps(dynamics):
+        return _quotients(plan, dynamics, stock, supplies, follows, interval)
+    controls = supply(masses, inner, controls, interval, follows)
+    by_stock, by_schedule = IntervalMaps(dynamics).responses(masses, dynamics.rate(controls, interval))
+    fixed = supply.rows[follows.ravel()]
+    slopes = _quotients(plan, dynamics, stock, supplies, np.zeros_like(follows), interval, (fixed, controls[fixed]))
+    following = FollowingSupplies(supply, follows, interval, controls, by_schedule)
+    return replace(slopes, by_stock=following.after(by_stock), by_action=following.after(slopes.by_action))
+
+
+def _quotients(
+    plan: ActionPlan,
+    dynamics: Dynamics,
+    stock: Floats,
+    supplies: IdleSupplies,
+    follows: Bools,
+    interval: Integers,
+    fixed: tuple[Integers, Floats] | None = None,
+) -> Slopes:
+    """Return the slopes as difference quotients, by actions alone if some controls are ``fixed``: rows and values."""
+    network, nodes, (steps, entries) = plan.network, dynamics.rows.nodes.stop, plan.actions.shape
     inputs, brought = np.concatenate([stock[:-1], plan.actions], axis=1), len(supplies.services)
-    count = nodes + entries + brought
+    shifted = np.arange(nodes if fixed else 0, nodes + entries)
+    count = len(shifted) + brought
     scale = np.array([node.scale for node in dynamics.staged_network.stores])
     width = np.concatenate([np.maximum(stock.max(axis=0), scale), np.ones(entries)]) * DIFFERENCE
     # forward in stocks, which may be 0; inward in actions, which may be at a bound, and in what is brought
     # one batch simulates all difference quotients of all intervals: column (t, j) has input j of interval t shifted
     shift = np.where(np.arange(nodes + entries) < nodes, 1.0, -np.where(inputs >= 0, 1.0, -1.0)) * width
+    shift = shift[:, shifted]
     inward = np.where(supplies.high > -supplies.low, 1.0, -1.0) * DIFFERENCE * np.maximum(supplies.size, TINY)
     columns = np.repeat(inputs[:, :, None], count + 1, axis=2)
-    columns[:, np.arange(nodes + entries), np.arange(nodes + entries)] += shift
+    columns[:, shifted, np.arange(len(shifted))] += shift
     flat = np.ascontiguousarray(columns.transpose(1, 0, 2).reshape(nodes + entries, -1))
     interval = np.repeat(interval, count + 1)
     controls = Actuators(network, plan.agents or None, flat.shape[1]).controls(flat[nodes:], interval)
     columns = np.repeat(supplies.controls[:, :, None], count + 1, axis=2)
-    columns[:, :, nodes + entries : count] += (supplies.unit * inward.T[:, None]).transpose(1, 2, 0)
+    columns[:, :, len(shifted) : count] += (supplies.unit * inward.T[:, None]).transpose(1, 2, 0)
     controls[supplies.rows] = columns.reshape(len(columns), flat.shape[1])
+    if fixed is not None:
+        controls[fixed[0]] = np.repeat(fixed[1], count + 1, axis=1)
     stocks, inner = dynamics.extend(flat[:nodes]), np.empty((0, flat.shape[1]))
-    _, done = supply.advance(stocks, inner, controls, interval, idle & (not is_held))
+    _, done = Supply(dynamics).advance(stocks, inner, controls, interval, follows)
     flows = np.concatenate([done.moved_mass, done.moved_substances]) / network.episode.control_interval
-    outputs = np.concatenate([done.stock[rows.nodes], flows])
+    outputs = np.concatenate([done.stock[dynamics.rows.nodes], flows])
     by_interval = outputs.reshape(len(outputs), steps, -1).transpose(1, 0, 2)
     slopes = (by_interval[:, :, :-1] - by_interval[:, :, -1:]) / np.concatenate([shift, inward], axis=1)[:, None]
-    return Slopes(slopes[:, :, :nodes], slopes[:, :, nodes:], np.ascontiguousarray(by_interval[:, :, -1]), supplies)
+    end, stocks_shifted = np.ascontiguousarray(by_interval[:, :, -1]), len(shifted) - entries
+    return Slopes(slopes[:, :, :stocks_shifted], slopes[:, :, stocks_shifted:], end, supplies)
