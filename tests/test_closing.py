@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -81,21 +82,39 @@ def test_a_solver_that_fails_takes_nothing_back(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_plans_are_made_again_while_one_is_short(degrees: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
-    """A plan that keeps what is demanded stays; one that does not has no gap, and is made again from the next bound."""
+    """A plan without a gap, as it is short, waits for the next bound, and every plan goes on from where it was."""
     made = list[int]()
 
     def short(found: Bound, **options: Any) -> Bound:
         made.append(found.degree)
         if found.degree > 1:
-            return improve_plan(found, **options)
-        return replace(found, actions=0.0 * found.actions + EMPTYING)
+            np.testing.assert_array_equal(found.actions, last[-1].actions)
+            last.append(improve_plan(found, **options))
+            return last[-1]
+        last.append(replace(found, actions=0.0 * found.actions + EMPTYING))
+        return last[-1]
 
+    last = list[Bound]()
     monkeypatch.setattr(closing, "improve_plan", short)
     found = close_gap(SHORT, within=1e-4, degrees=(1, 2, 3), min_service=0.95)
-    assert degrees == [1, 2, 3] and made == [1, 2]
+    assert degrees == made == [1, 2, 3]
     assert found.gap < 0.01
     degrees.clear()
     assert math.isnan(close_gap(SHORT, degrees=(1,), min_service=0.95).gap)
+
+
+def test_a_plan_that_gets_hardly_nearer_waits_for_a_tighter_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step has to make a quarter of what is still too much of the gap, unless no further bound will be proved."""
+    answers = list[list[bool]]()
+
+    def steps(found: Bound, *, enough: Callable[[Any], bool], **options: Any) -> Bound:
+        answers.append([enough(value) for value in (0.9, 0.5, 0.4, 0.39, 0.1)])
+        return found
+
+    monkeypatch.setattr(closing, "improve_plan", steps)
+    monkeypatch.setattr(closing, "_gap", lambda solution, run: run if isinstance(run, float) else 0.9)
+    close_gap(SHORT, within=0.1, degrees=(1, 2), min_service=0.95)
+    assert answers == [[False, False, False, True, True], [False, False, False, False, True]]
 
 
 def test_steps_that_promise_little_are_not_made(monkeypatch: pytest.MonkeyPatch) -> None:
