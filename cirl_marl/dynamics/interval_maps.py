@@ -48,14 +48,14 @@ class IntervalMaps:
         start, is_cut, per_stock = self._start(), *self._limits(stock, rate)
         response = np.empty((steps, stocks + len(dynamics.network.arcs), len(start)))
         for t in range(steps):
-            substep, state, moved = self._substep(rate[:, [t]]), start, np.zeros((1, 1))
+            substep, state, transfer = self._substep(rate[:, [t]]), start, np.zeros((1, 1))
             # substeps in which the same flows are cut
             changes = np.flatnonzero((is_cut[1:, :, t] != is_cut[:-1, :, t]).any(axis=1)) + 1
             for run in np.split(np.arange(dynamics.substeps), changes):
                 of_run = self._with_limits(substep, is_cut[run[0], :, t], per_stock[run[0], :, t])
                 whole, through = _power(of_run[:stocks], of_run[stocks:], len(run))
-                moved, state = moved + through @ state, whole @ state
-            response[t] = np.concatenate([state[:stocks], moved / dynamics.network.episode.control_interval])
+                transfer, state = transfer + through @ state, whole @ state
+            response[t] = np.concatenate([state[:stocks], transfer / dynamics.network.episode.control_interval])
         return response[:, :, :stocks], response[:, :, stocks:]
 
     def _limits(self, stock: Floats, rate: Floats) -> tuple[Bools, Floats]:
@@ -68,8 +68,8 @@ class IntervalMaps:
         assert dynamics.taylor is not None
         for j in range(dynamics.substeps if len(self.arcs) else 0):
             is_cut[j], per_stock[j] = dynamics.scheduled.limits(stock, rate)
-            moved = dynamics.taylor.moved_mass(stock, routes, None, dynamics.scheduled.cut(stock, rate))
-            stock = dynamics.incidence.add_to(stock.copy(), moved)
+            transfer = dynamics.taylor.moved_mass(stock, routes, None, dynamics.scheduled.cut(stock, rate))
+            stock = dynamics.incidence.add_to(stock.copy(), transfer)
         return is_cut.astype(bool), per_stock
 
     def _substep(self, rate: Floats) -> Floats:
@@ -82,27 +82,27 @@ class IntervalMaps:
         masses[dynamics.rows.unit, stocks:] = 1.0
         rates[self.arcs, stocks:] = np.eye(len(self.arcs))
         assert dynamics.taylor is not None
-        moved = dynamics.taylor.moved_mass(masses, dynamics.routing.routes(rates), None, rates)
-        after = dynamics.incidence.add_to(masses, moved)
-        return np.concatenate([after[:stocks], moved[: len(dynamics.network.arcs)]])
+        transfer = dynamics.taylor.moved_mass(masses, dynamics.routing.routes(rates), None, rates)
+        after = dynamics.incidence.add_to(masses, transfer)
+        return np.concatenate([after[:stocks], transfer[: len(dynamics.network.arcs)]])
 
     def _with_limits(self, substep: Floats, is_cut: Bools, per_stock: Floats) -> Floats:
         """Return a substep in which flows that are cut follow from the stocks of their donors."""
-        limited, stocks = substep.copy(), self._dynamics.rows.nodes.stop
+        response, stocks = substep.copy(), self._dynamics.rows.nodes.stop
         for k in np.flatnonzero(is_cut).tolist():
-            limited[:, self._donors[k]] += per_stock[k] * substep[:, stocks + k]
-            limited[:, stocks + k] = 0.0
-        return limited
+            response[:, self._donors[k]] += per_stock[k] * substep[:, stocks + k]
+            response[:, stocks + k] = 0.0
+        return response
 
     def _start(self) -> Floats:
         """Return z at the start of an interval: slots move on, and what comes out of them is asked for."""
         dynamics, stocks = self._dynamics, self._dynamics.rows.nodes.stop
         state = np.eye(stocks + len(self.arcs))
         if dynamics.slots is not None:
-            shifted = dynamics.slots.shift_slots(np.eye(dynamics.rows.masses))[:, :stocks]
+            masses = dynamics.slots.shift_slots(np.eye(dynamics.rows.masses))[:, :stocks]
             outflow = np.zeros((len(dynamics.staged_network.arcs), stocks))
-            dynamics.slots.set_outflows(shifted, outflow)
-            state[:stocks, :stocks], state[stocks:, :stocks] = shifted[:stocks], outflow[self.arcs]
+            dynamics.slots.set_outflows(masses, outflow)
+            state[:stocks, :stocks], state[stocks:, :stocks] = masses[:stocks], outflow[self.arcs]
         return state
 
 
@@ -141,17 +141,17 @@ class FollowingSupplies:
 
     def after(self, slopes: Floats) -> Floats:
         """Return derivatives with what follows, shape (steps, rows, …), of those at held controls."""
-        followed: Floats = slopes - self._gains @ (self._measures @ slopes)
-        return followed
+        result: Floats = slopes - self._gains @ (self._measures @ slopes)
+        return result
 
 
-def _power(step: Floats, moved: Floats, count: int) -> tuple[Floats, Floats]:
+def _power(step: Floats, transfer: Floats, count: int) -> tuple[Floats, Floats]:
     """Return W^count, and F (1 + W + … + W^(count − 1)), by repeated squaring; of W the rows of stocks are given."""
     stocks, size = step.shape
     step = np.concatenate([step, np.eye(size - stocks, size, k=stocks)])
-    whole, total = step, moved
+    whole, total = step, transfer
     for bit in f"{count:b}"[1:]:
         total, whole = total + total @ whole, whole @ whole
         if bit == "1":
-            total, whole = moved + total @ step, whole @ step
+            total, whole = transfer + total @ step, whole @ step
     return whole, total

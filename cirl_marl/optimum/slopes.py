@@ -89,10 +89,14 @@ def jacobians(plan: ActionPlan, dynamics: Dynamics, first: int = 0) -> Slopes:
         return _quotients(plan, dynamics, stock, supplies, follows, interval)
     controls = supply(masses, inner, controls, interval, follows)
     by_stock, by_schedule = IntervalMaps(dynamics).responses(masses, dynamics.rate(controls, interval))
-    fixed = supply.rows[follows.ravel()]
-    slopes = _quotients(plan, dynamics, stock, supplies, np.zeros_like(follows), interval, (fixed, controls[fixed]))
-    following = FollowingSupplies(supply, follows, interval, controls, by_schedule)
-    return replace(slopes, by_stock=following.after(by_stock), by_action=following.after(slopes.by_action))
+    idle_rows = supply.rows[follows.ravel()]
+    slopes = _quotients(
+        plan, dynamics, stock, supplies, np.zeros_like(follows), interval, (idle_rows, controls[idle_rows])
+    )
+    following_supplies = FollowingSupplies(supply, follows, interval, controls, by_schedule)
+    return replace(
+        slopes, by_stock=following_supplies.after(by_stock), by_action=following_supplies.after(slopes.by_action)
+    )
 
 
 def _quotients(
@@ -102,35 +106,35 @@ def _quotients(
     supplies: IdleSupplies,
     follows: Bools,
     interval: Integers,
-    fixed: tuple[Integers, Floats] | None = None,
+    fixed_controls: tuple[Integers, Floats] | None = None,
 ) -> Slopes:
-    """Return the slopes as difference quotients, by actions alone if some controls are ``fixed``: rows and values."""
+    """Return the slopes as difference quotients; by actions alone where rows and values of some controls are given."""
     network, nodes, (steps, entries) = plan.network, dynamics.rows.nodes.stop, plan.actions.shape
     inputs, brought = np.concatenate([stock[:-1], plan.actions], axis=1), len(supplies.services)
-    shifted = np.arange(nodes if fixed else 0, nodes + entries)
-    count = len(shifted) + brought
+    shifted_rows = np.arange(nodes if fixed_controls else 0, nodes + entries)
+    count = len(shifted_rows) + brought
     scale = np.array([node.scale for node in dynamics.staged_network.stores])
     width = np.concatenate([np.maximum(stock.max(axis=0), scale), np.ones(entries)]) * DIFFERENCE
     # forward in stocks, which may be 0; inward in actions, which may be at a bound, and in what is brought
     # one batch simulates all difference quotients of all intervals: column (t, j) has input j of interval t shifted
     shift = np.where(np.arange(nodes + entries) < nodes, 1.0, -np.where(inputs >= 0, 1.0, -1.0)) * width
-    shift = shift[:, shifted]
+    shift = shift[:, shifted_rows]
     inward = np.where(supplies.high > -supplies.low, 1.0, -1.0) * DIFFERENCE * np.maximum(supplies.size, TINY)
     columns = np.repeat(inputs[:, :, None], count + 1, axis=2)
-    columns[:, shifted, np.arange(len(shifted))] += shift
+    columns[:, shifted_rows, np.arange(len(shifted_rows))] += shift
     flat = np.ascontiguousarray(columns.transpose(1, 0, 2).reshape(nodes + entries, -1))
     interval = np.repeat(interval, count + 1)
     controls = Actuators(network, plan.agents or None, flat.shape[1]).controls(flat[nodes:], interval)
     columns = np.repeat(supplies.controls[:, :, None], count + 1, axis=2)
-    columns[:, :, len(shifted) : count] += (supplies.unit * inward.T[:, None]).transpose(1, 2, 0)
+    columns[:, :, len(shifted_rows) : count] += (supplies.unit * inward.T[:, None]).transpose(1, 2, 0)
     controls[supplies.rows] = columns.reshape(len(columns), flat.shape[1])
-    if fixed is not None:
-        controls[fixed[0]] = np.repeat(fixed[1], count + 1, axis=1)
+    if fixed_controls is not None:
+        controls[fixed_controls[0]] = np.repeat(fixed_controls[1], count + 1, axis=1)
     stocks, inner = dynamics.extend(flat[:nodes]), np.empty((0, flat.shape[1]))
     _, done = Supply(dynamics).advance(stocks, inner, controls, interval, follows)
     flows = np.concatenate([done.moved_mass, done.moved_substances]) / network.episode.control_interval
     outputs = np.concatenate([done.stock[dynamics.rows.nodes], flows])
     by_interval = outputs.reshape(len(outputs), steps, -1).transpose(1, 0, 2)
     slopes = (by_interval[:, :, :-1] - by_interval[:, :, -1:]) / np.concatenate([shift, inward], axis=1)[:, None]
-    end, stocks_shifted = np.ascontiguousarray(by_interval[:, :, -1]), len(shifted) - entries
+    end, stocks_shifted = np.ascontiguousarray(by_interval[:, :, -1]), len(shifted_rows) - entries
     return Slopes(slopes[:, :, :stocks_shifted], slopes[:, :, stocks_shifted:], end, supplies)
