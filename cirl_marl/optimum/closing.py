@@ -34,8 +34,8 @@ NEGLIGIBLE = 0.05
 """Part of the gap that is asked for, which a step of a plan has to promise to be made."""
 STALLED = 0.25
 """Part of what a plan is still too far from the bound, which a step has to bring it nearer, or a tighter bound comes
-before the next: plans of 22 cycles with lifetimes closed in two steps, or were past them more than a bound of degree 1
-was tight."""
+before the next. Of 12 cycles with lifetimes nine closed at degree 1 within two steps. Further ones, up to ten,
+brought six others 0.2 % nearer at most, and degree 2 up to 3 %."""
 
 
 @frozen_record
