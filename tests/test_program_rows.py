@@ -577,32 +577,6 @@ def test_a_furnace_that_is_fed_by_schedule_is_known(rate: float) -> None:
         assert end == pytest.approx(4.0 / rate + (2.0 - 4.0 / rate) * math.exp(-rate), rel=1e-6)
 
 
-@pytest.mark.parametrize(("degree", "below", "above"), [(1, 0.13, 0.22), (2, 0.035, 0.03)])
-def test_what_enters_a_stock_leaves_it_by_polynomials(degree: int, below: float, above: float) -> None:
-    """A furnace in which metal stays about as long as a merged piece is, behind a stock that gives ever less."""
-    network = Network(
-        name="foundry",
-        nodes=(
-            Node(id="yard", initial=(9.0, 9.0)),
-            Node(id="furnace", initial=(2.0, 2.0)),
-            Node(id="tip", role=Role.LANDFILL, initial=(1.0, 1.0)),
-        ),
-        arcs=(
-            Arc(id="charge", donor="yard", recipient="furnace", rate=0.9),
-            Arc(id="slag", donor="furnace", recipient="tip", rate=1.7),
-        ),
-        episode=Episode(control_interval=1.0, horizon=1),
-    )
-    programs = Programs(Admissible.of(network), degree, None, merge_pieces=True)
-    problem, last = programs.program(network.initial[1]), programs.layout.last.start + network.node_index["furnace"]
-    exact = 2.0 * math.exp(-1.7) + 8.1 * (math.exp(-0.9) - math.exp(-1.7)) / 0.8
-    ends = [
-        float(solve(replace(problem, cost=sign * (np.arange(len(problem.cost)) == last))).plan[last])
-        for sign in (1.0, -1.0)
-    ]
-    assert exact * (1 - below) < ends[0] <= exact <= ends[1] < exact * (1 + above)
-
-
 @pytest.mark.medium
 @pytest.mark.sample(2)
 @pytest.mark.parametrize("merged", [False, True])

@@ -40,7 +40,7 @@ from cirl_marl.optimum.effort import charged_controls, effort_rows, largest_dist
 from cirl_marl.optimum.excess import excess_rows
 from cirl_marl.optimum.matrices import BEFORE, NOW, ChainedRows, IntervalCache, Layout, ProgramRows, RowParts
 from cirl_marl.optimum.mixtures import content_rows, mixture_rows
-from cirl_marl.optimum.quasi_steady import decay_rows, end_laws, has_fast_stocks, quasi_steady_rows, remainder_rows
+from cirl_marl.optimum.quasi_steady import decay_rows, end_laws, has_fast_stocks, quasi_steady_rows
 from cirl_marl.optimum.reach import ComparisonSystem, Reach
 from cirl_marl.optimum.shortages import shortage_rows
 from cirl_marl.optimum.transit import ConstantShares, Transit, steady_rows
@@ -180,8 +180,6 @@ class Programs:
         service_levels(ranges, under)
         if layout.degree:
             decay_rows(ranges, under_links)
-            if layout.coarse:
-                remainder_rows(ranges, under_links)
         else:
             mean_stocks(ranges, equal_links)
             held_arcs = np.flatnonzero(ranges.proportional & (ranges.rate[0] < ranges.rate[1]))

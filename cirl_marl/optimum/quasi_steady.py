@@ -23,8 +23,6 @@ and g, and for (w − w̲) and (w̄ − w) times what a factor w acts on. Of x_j
 
 from __future__ import annotations
 
-from functools import cache
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -32,17 +30,14 @@ from numpy.typing import NDArray
 from scipy import sparse, special
 
 from cirl_marl.network import Floats, Integers
-from cirl_marl.network.lifetimes import Chain
 from cirl_marl.optimum.admissible import Admissible, IntervalRanges
-from cirl_marl.optimum.kernels import Kernel, bernstein_means
+from cirl_marl.optimum.kernels import bernstein_means
 from cirl_marl.optimum.matrices import Layout, ProgramRows
 from cirl_marl.optimum.reach import Linear
 
 FAST = 2.0
 """Turnovers in a piece from which on a stock counts as fast. Rows for 0.5 and 8 beside it, twice as many, brought
 3e-6 of the bound at most on five generated cycles with one piece a year, 1.4e-4 with five."""
-REMAINING = 4.0
-"""Turnovers in a piece up to which polynomials say how much of what enters is left: at 3 by a third, at degree 2."""
 WIDER, ROUND_OFF = 1.0 + 1e-9, 1e-12
 """Factor and allowance by which transients are widened; rounding errors are far smaller."""
 
@@ -75,36 +70,6 @@ def decay_rows(ranges: IntervalRanges, rows: ProgramRows) -> None:
         np.where(behind, ranges.setting[:, arcs] * ranges.base[arcs], ranges.rate[:, arcs]),
         np.where(behind, ranges.valve[1, driver], 1.0),
     )
-
-
-def remainder_rows(ranges: IntervalRanges, rows: ProgramRows) -> None:
-    """Add how much of what enters a stock is left at the end of a merged piece; keys (1, node, piece, −2, side).
-
-    Of an inflow u ≥ 0 past which x is left at a rate between k̲ and k̄ there is x(δ) = e^{−kδ} x(0) + ∫ e^{−k(δ−s)} u ds.
-    Polynomials above it for k̲, and below it for k̄, make this a sum of the moments of u, as with lifetimes.
-    """
-    network, layout, stores = ranges.network, rows.layout, len(ranges.network.stores)
-    is_other = ranges.by_schedule | ranges.leaves_lifetime | (ranges.driver != network.donors)
-    others = network.donors[is_other]
-    turnovers = ranges.exits[:, :stores] * layout.length
-    nodes = np.setdiff1d(np.flatnonzero((turnovers[1] > 0) & (turnovers[1] <= REMAINING)), others)
-    piece = np.arange(layout.pieces)[:, None]
-    moments = piece * (layout.degree + 1) + np.arange(layout.degree + 1)
-    for node, (side, sign) in product(nodes.tolist(), enumerate((1.0, -1.0))):
-        remains, shares = _remainder(float(ranges.exits[side, node]), layout.length, layout.degree)[side]
-        row = rows.add(1, node, piece, -2, side)
-        rows.put(row, layout.end[piece] + node, sign)
-        rows.at_start(row, piece, node, -sign * remains)
-        inflows = np.flatnonzero(network.recipients == node)
-        rows.put(row[..., None], layout.flow[moments][..., None] + inflows, -sign * shares[:, None])
-
-
-@cache
-def _remainder(rate: float, length: float, degree: int) -> tuple[tuple[float, Floats], tuple[float, Floats]]:
-    """Return the most and the least that is left of a stock, and of the moments of what enters, time, after a piece."""
-    kernel = Kernel(Chain(rate=1.0, weights=(0.0, 1.0), error=0.0), np.array([rate]), length, degree)
-    remains, (low, high) = float(kernel.start_survivors[0, 0]), (kernel.survivors_low, kernel.survivors_high)
-    return (remains * WIDER, high[0, 0]), (remains / WIDER, low[0, 0])
 
 
 class _DecayChains:
