@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from benchmarks.document import markdown_table, measured_table, write_sections
 from benchmarks.food_bank import BestOrders, SafetyStock
@@ -67,7 +68,6 @@ SIGHT: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Any]]] = {
     "local": ({"mode": "local"}, {}),
     "neighbours": ({"mode": "neighbours"}, {}),
     "all stocks": ({"mode": "full"}, {}),
-    "countdown": ({"mode": "local", "countdown": True}, {}),
     "late": ({"mode": "local"}, {"delayed": 1}),
     "never": ({"mode": "local"}, {"observed": "none"}),
     "forecasts of 1": ({"mode": "local"}, {"forecast": 1}),
@@ -223,7 +223,7 @@ def bound_figures(found: UncertainBound, seconds: float) -> dict[str, Any]:
 
 
 def measured(
-    name: str, make: Maker, found: UncertainBound, tune: int | None, episodes: int, margin: float = 1.0
+    name: str, make: Maker, found: UncertainBound, tune: int | None, episodes: int, margin: ArrayLike = 1.0
 ) -> dict[str, Any]:
     """Return the figures of a contender on the first draws of a bound, its margin set on others if ``tune`` says so."""
     network, figures = found.network, dict[str, Any]()

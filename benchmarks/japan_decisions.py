@@ -11,6 +11,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from benchmarks.foresight import CONTENDERS, RESULTS, calibration_of, proof
 from benchmarks.uncertain import DEMANDED, WORLDS, contenders
@@ -88,8 +89,8 @@ def decisions(name: str, groups: Mapping[str, Sequence[str]]) -> Iterator[str]:
     knob, blind_knob = kept["price_policy"]["knob"], kept["best_schedule"]["knob"]
     plan_knob = json.loads(KNOBS.read_text())[name]["contenders"]["plan"]["knob"]
 
-    def looking(margin: float = 1.0) -> MPC:
-        return MPC(min_service=DEMANDED, prices=found.prices, margin=knob * margin)
+    def looking(margin: ArrayLike = 1.0) -> MPC:
+        return MPC(min_service=DEMANDED, prices=found.prices, margin=np.multiply(knob, margin))
 
     def outcome(controller: Controller) -> tuple[Floats, float]:
         run = rollout(MultiAgentVectorEnv(network, num_envs=DRAWS), controller, seed=first_seed(seed))
@@ -107,7 +108,7 @@ def decisions(name: str, groups: Mapping[str, Sequence[str]]) -> Iterator[str]:
         return over_episodes((loss - least) / 1e3), level
 
     def without(agents: Sequence[str]) -> tuple[Aggregate, float]:
-        def settled(margin: float) -> Controller:
+        def settled(margin: ArrayLike) -> Controller:
             return Settled(looking(margin), agents, actions.mean(axis=2))
 
         return regret(settled(calibration_of(network, settled, EARLIER_DRAWS).margin))

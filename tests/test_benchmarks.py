@@ -152,8 +152,6 @@ def test_who_sees_more_or_less_meets_the_same_world(world: uncertain.World) -> N
     widths = {sight: sum(space.shape[0] for space in env.observation_spaces.values()) for sight, env in envs.items()}
     assert widths["never"] < widths["local"] == widths["late"] < widths["forecasts of 1"] < widths["of 4"]
     assert widths["local"] < widths["neighbours"] <= widths["all stocks"]
-    agents = 0 if network.observation.countdown else len(envs["local"].agents)
-    assert widths["countdown"] == widths["local"] + agents
 
 
 def outcomes(found: UncertainBound, make: foresight.Maker) -> tuple[Any, Any]:

@@ -64,8 +64,9 @@ def test_margins_on_budgets_rise_until_the_mean_keeps_them(monkeypatch: pytest.M
     for budgets, least in (({"emissions": 950.0, "emissions/year": 1.0}, 1.05), ({"emissions": 1100.0}, 1.0)):
         result = calibration.calibrate(**options, aims=aims_of(network, "circularity", budgets))
         most = budgets["emissions"]
-        level = 0.8 * result.margin**0.5 / result.budget_margin**0.2
-        used = 1000.0 * result.margin**0.1 / result.budget_margin**0.5
+        margin = float(np.max(result.margin))
+        level = 0.8 * margin**0.5 / result.budget_margin**0.2
+        used = 1000.0 * margin**0.1 / result.budget_margin**0.5
         assert result.excess == pytest.approx(level - 0.85) and abs(result.excess) < 0.002
         assert result.overrun == pytest.approx(max(0.0, used / most - 1)) and result.overrun <= 0.001
         assert result.budget_margin >= least and (least > 1.0 or result.budget_margin == 1.0)

@@ -18,7 +18,6 @@ from cirl_marl import (
     Law,
     MultiAgentVectorEnv,
     Network,
-    NetworkError,
     Node,
     Role,
     Service,
@@ -90,15 +89,19 @@ def test_an_arc_sees_both_its_ends() -> None:
 
 
 def test_a_countdown_tells_the_last_intervals_apart() -> None:
-    """It is 1/(intervals left), and stands after the time; who does not ask for it sees what was seen before."""
-    network = SHIPPED.with_options(observation={"mode": "local", "countdown": True}, episode={"horizon": 3})
-    env = MultiAgentVectorEnv(network, num_envs=2, agents=["belt"])
-    first = env.reset(0)["belt"]
-    assert env.observation_names["belt"][-2:] == ("time", "countdown")
-    seen = [first[0, -1], *(env.advance(np.zeros((1, 2))).observation[-1, 0] for _ in range(2))]
-    np.testing.assert_allclose(seen, [1 / 3, 1 / 2, 1.0], rtol=1e-6)
-    with pytest.raises(NetworkError, match="mode 'stocks' shows nothing else, so no countdown"):
-        network.with_options(observation={"mode": "stocks", "nodes": ("mine",)})
+    """It is 1/(intervals left), and stands last; an option of the environment goes before the network's own."""
+    short = SHIPPED.with_options(observation={"mode": "local"}, episode={"horizon": 3})
+    network = short.with_options(observation={"countdown": True})
+    stocks = short.with_options(observation={"mode": "stocks", "nodes": ("mine",)})
+    for world, option, before in ((network, None, "time"), (short, True, "time"), (stocks, True, "stock of mine")):
+        env = MultiAgentVectorEnv(world, num_envs=2, agents=["belt"], countdown=option)
+        first = env.reset(0)["belt"]
+        assert env.observation_names["belt"][-2:] == (before, "countdown") and not env.layout.array_order
+        seen = [first[0, -1], *(env.advance(np.zeros((1, 2))).observation[-1, 0] for _ in range(2))]
+        np.testing.assert_allclose(seen, [1 / 3, 1 / 2, 1.0], rtol=1e-6)
+    for world, option in ((network, False), (short, None)):
+        without = MultiAgentVectorEnv(world, num_envs=2, agents=["belt"], countdown=option)
+        assert without.observation_names["belt"][-1] == "time"
 
 
 def test_a_delivery_is_seen_as_a_mass() -> None:

@@ -139,6 +139,7 @@ def test_budgets_that_margins_do_not_keep_are_told() -> None:
         row = SimpleNamespace(name="mpc", seeds=(), has_few_seeds=False, entries=[entry])
         baseline = SimpleNamespace(reason="")
         comparison: Any = SimpleNamespace(ties=None, rows=[row], entries=[entry], baseline=baseline, misses=lambda: {})
+        comparison.network = loop()
         notes = tradeoffs.comparison_notes(comparison)
         assert notes[0] == "margins, set on other draws: mpc 1.05"
         assert any("exceeds a budget by 2.0% there" in note for note in notes) == (factor > 1)

@@ -281,11 +281,19 @@ def test_policies_of_others_are_refused(own_copper_run: Path) -> None:
 
 
 def test_policies_act_on_what_they_learnt_to_see(copper_run: Path) -> None:
-    """An environment that shows something else is refused, with what it shows; options make the difference."""
+    """Whatever an environment shows; a network in which they would see something else is refused."""
     policy = Trained(copper_run)
-    with pytest.raises(RunError, match=r"learnt from other observations .* with the options of the run"):
-        policy.start(MultiAgentVectorEnv("copper_net", num_envs=2, observe="full"), seed=0)
-    rollout(MultiAgentVectorEnv("copper_net", num_envs=2, horizon=3), policy, seed=0)
+    runs = [
+        rollout(MultiAgentVectorEnv("copper_net", num_envs=2, horizon=3, **shown), policy, seed=0)
+        for shown in ({}, {"observe": "full"}, {"countdown": True})
+    ]
+    for run in runs[1:]:
+        np.testing.assert_array_equal(run.stock, runs[0].stock)
+        np.testing.assert_array_equal(run.controls, runs[0].controls)
+    other = cirl_marl.load_network("copper_net")
+    other = replace(other, nodes=tuple(replace(node, set_point=1.0) for node in other.nodes))
+    with pytest.raises(RunError, match=r"learnt from other observations \(set-point of"):
+        policy.start(MultiAgentVectorEnv(other, num_envs=2), seed=0)
 
 
 def test_failed_writing_leaves_the_old_file_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

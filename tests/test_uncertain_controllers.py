@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from disturbed_line import EVERYWHERE, line
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from small_networks import KINDS
 from test_mpc import ORDER, in_use
 from test_optimum import certifiable
@@ -21,6 +22,7 @@ from cirl_marl.controllers.rollout import first_seed, rollout
 from cirl_marl.evaluation import calibration
 from cirl_marl.evaluation.calibration import calibrate
 from cirl_marl.network.disturbances import DisturbanceEffect, Markov
+from cirl_marl.network.elements import FeedbackRule
 from cirl_marl.network.processes import DisturbanceProcesses
 from cirl_marl.network.uncertainty import Spread, expected_network
 from cirl_marl.optimum import NoCertificate, Sampling, blind, futures, simulate_plan
@@ -314,7 +316,7 @@ def test_margins_are_set_on_draws_of_their_own() -> None:
     levels = {m: rollout(env(40), Shifted(m), seed=calibration.FIRST_DRAW).episode_levels.mean() for m in (1.0, 1.2)}
     demand = np.array([0.3 * levels[1.0] + 0.7 * levels[1.2]])
     result = calibrate(env, Shifted, demand, 40)
-    again = rollout(env(40), Shifted(result.margin), seed=calibration.FIRST_DRAW)
+    again = rollout(env(40), Shifted(float(np.max(result.margin))), seed=calibration.FIRST_DRAW)
     assert abs(result.excess) <= calibration.CLOSE / 2
     assert again.episode_levels.mean() - demand[0] == pytest.approx(result.excess)
     assert calibrate(env, lambda margin: Shifted(1.0), np.ones(1), 10).excess < -0.05
@@ -323,6 +325,86 @@ def test_margins_are_set_on_draws_of_their_own() -> None:
     for draws, message in ((10.5, "tune must be a whole number"), (10**7, "more draws than seeds set apart")):
         with pytest.raises(CirlError, match=message):
             calibrate(env, Shifted, demand, draws)  # type: ignore[arg-type]
+
+
+def two_stockists() -> Network:
+    """Return two stores that sell from one mine, each by orders of its own, to a demand of its own."""
+    one, shop = stockist(8), ("north", "south")
+    (mine, *nodes), (order, demand), (served,) = one.nodes, one.arcs, one.services
+    rule = FeedbackRule(watches=("",), gains=(1.0,))
+    return replace(
+        one,
+        nodes=(mine, *(replace(node, id=f"{node.id}_{at}") for node in nodes for at in shop)),
+        arcs=tuple(
+            arc
+            for at in shop
+            for arc in (
+                replace(
+                    order, id=f"order_{at}", recipient=f"store_{at}", rule=replace(rule, watches=(f"served_{at}",))
+                ),
+                replace(demand, id=f"demand_{at}", donor=f"store_{at}", recipient=f"use_{at}"),
+            )
+        ),
+        services=tuple(replace(served, id=f"served_{at}", provider=f"demand_{at}") for at in shop),
+        disturbances={at: one.disturbances["custom"] for at in shop},
+        disturbed={
+            path: DisturbanceEffect(by=at)
+            for at in shop
+            for path in (f"arcs.demand_{at}.flow", f"services.served_{at}.low")
+        },
+    )
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_each_service_has_the_margin_that_delivers_it(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where one service takes a little from the others; what all that is done for it leaves over is told apart."""
+    rng = np.random.default_rng(seed)
+    count, tried = int(rng.integers(2, 5)), list[Floats]()
+    slopes, base = np.diag(rng.uniform(0.02, 0.1, count)), rng.uniform(0.97, 0.999, count)
+    slopes -= rng.uniform(0.0, 0.2, (count, count)) * slopes.diagonal().min() * (1 - np.eye(count)) / count
+    is_anyway = rng.random(count) < 0.3  # delivered, whatever is charged for it
+    slopes[is_anyway], base[is_anyway] = 0.0, 1.0
+
+    def levels(margin: ArrayLike) -> Floats:
+        excess: Floats = base + slopes @ np.log(np.broadcast_to(margin, count))
+        return excess
+
+    def played(env: MultiAgentVectorEnv, margin: Any, seed: int) -> Any:
+        tried.append(np.broadcast_to(margin, count))
+        noise = np.linspace(-0.3, 0.3, env.num_envs)[:, None]
+        accounts = np.zeros((env.num_envs, 2))
+        return SimpleNamespace(episode_levels=levels(margin) + noise, accounts=accounts, bookings=accounts[:, :, None])
+
+    monkeypatch.setattr(calibration, "rollout", played)
+    made: dict[str, Any] = {"env": lambda copies: MultiAgentVectorEnv(stockist(5), num_envs=copies)}
+    result = calibrate(**made, controller=lambda margin: margin, demand=np.full(count, 0.99), draws=10)
+    excess = levels(result.margin) - 0.99
+    assert result.excess == pytest.approx(excess.min()) and len(tried) <= calibration.TRIES
+    assert (np.abs(excess[~is_anyway]) <= calibration.CLOSE / 2).all()
+    assert (excess[is_anyway] > 0.009).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["mpc", "best_schedule", "scripted"])
+def test_a_margin_is_of_every_service_or_of_each(name: str) -> None:
+    """The same for all is one; a service that is worth more is delivered more; another number of them is refused."""
+    options: dict[str, Any] = {} if name == "scripted" else {"min_service": 0.8}
+    network = two_stockists()
+    env = MultiAgentVectorEnv(network, num_envs=6)
+
+    def made(margin: ArrayLike) -> Floats:
+        controller = named_controller(name, margin=margin, **options)
+        levels: Floats = rollout(env, controller, seed=3).episode_levels.mean(axis=0)
+        return levels
+
+    both = made(1.1)
+    np.testing.assert_array_equal(made([1.1, 1.1]), both)
+    first, second = made([2.0, 0.7]), made([0.7, 2.0])
+    assert first[0] > second[0] and second[1] > first[1]
+    with pytest.raises(CirlError, match=r"margin has shape \(3,\), expected \(2,\): a margin for each service"):
+        made([1.0, 1.0, 1.0])
+    with pytest.raises(CirlError, match=r"margin -1\.0 must be positive and finite"):
+        named_controller(name, margin=[1.0, -1.0], **options)
 
 
 @pytest.mark.medium

@@ -6,6 +6,7 @@ from collections.abc import Callable, Container, Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cirl_marl.compartments.incinerator import Incinerator
 from cirl_marl.controllers.basic import Arrays, Constant, Controller
@@ -120,10 +121,15 @@ class FeedbackRules:
         agents: those who have a rule.
     """
 
-    def __init__(self, env: MultiAgentVectorEnv, without: Container[str] = (), *, margin: float = 1.0) -> None:
-        """Take the rules of all agents but some; all that they aim at is multiplied by ``margin``."""
+    def __init__(self, env: MultiAgentVectorEnv, without: Container[str] = (), *, margin: ArrayLike = 1.0) -> None:
+        """Take the rules of all agents but some; what they aim at is multiplied by ``margin``.
+
+        It may be one for each service, shape (services,); the largest counts for stocks that have set-points.
+        """
         rules = {agent: env.network.compartments[agent].rule for agent in env.agents if agent not in without}
-        self._env, self._margin = env, margin
+        margins = env.network.by_service("margin", margin, "a margin")
+        self._env, self._largest_margin = env, float(np.max(margin))
+        self._margins = dict(zip((s.id for s in env.network.services), margins.tolist(), strict=True))
         self._rules: dict[str, FeedbackRule] = {agent: rule for agent, rule in rules.items() if rule is not None}
         self.agents = tuple(self._rules)
 
@@ -144,7 +150,7 @@ class FeedbackRules:
                 value = value * values[name]
             factor = np.ones_like(value)
             for name, gain in zip(rule.watches, rule.gains, strict=True):
-                factor += gain * (1.0 - (1.0 - lacks[name]) / self._margin)
+                factor += gain * (1.0 - (1.0 - lacks[name]) / self._margins.get(name, self._largest_margin))
             actions[agent] = env.normalise(agent, (value * factor)[None])
         return actions
 
@@ -152,10 +158,10 @@ class FeedbackRules:
 class ScriptController(Controller):
     """Acts by the agent's rule, or the script for its kind of model; others, and those held constant, do not listen."""
 
-    def __init__(self, constant: Mapping[str, float] | None = None, *, margin: float = 1.0) -> None:
+    def __init__(self, constant: Mapping[str, float] | None = None, *, margin: ArrayLike = 1.0) -> None:
         """Hold the actions of some agents, agent → value in [−1, 1]; others without a script stay neutral.
 
-        All that rules aim at is multiplied by ``margin``.
+        All that rules aim at is multiplied by ``margin``, or what each service aims at by its own, shape (services,).
         """
         self._constant, self._margin = Constant(constant), margin
         self._constant_agents = frozenset(constant or ())

@@ -140,9 +140,12 @@ class ObservationLayout:
         sights: what disturbances show.
     """
 
-    def __init__(self, dynamics: Dynamics, agents: Sequence[str], mode: str | None, batch: int) -> None:
-        """Lay out the observations of ``agents``; ``mode`` None takes the network's own."""
+    def __init__(
+        self, dynamics: Dynamics, agents: Sequence[str], mode: str | None, batch: int, countdown: bool | None = None
+    ) -> None:
+        """Lay out the observations of ``agents``; ``mode`` and ``countdown`` None take the network's own."""
         network = dynamics.network
+        self._has_countdown = network.observation.countdown if countdown is None else bool(countdown)
         mode = network.observation.mode if mode is None else mode
         check_names("observation mode", [mode], OBSERVE, "observe: ")
         if mode == "stocks" and not network.observation.nodes:
@@ -211,13 +214,17 @@ class ObservationLayout:
         with np.errstate(over="ignore"):
             np.multiply(quantities, self._inverse_scale, out=table[: self.signals.quantities], casting="same_kind")
         table[self.signals.time] = time
-        if self._network.observation.countdown:
+        if self._has_countdown:
             table[self.signals.countdown] = 1.0 / np.maximum(self._network.episode.horizon * (1.0 - time), 1.0)
         table[self.signals.levels] = levels
         if sight is not None:
             table[self.signals.seen] = sight
         observation: NDArray[Any] = table.take(self._index, axis=0)
         return observation
+
+    def by_agent(self, observation: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        """Split a stacked observation, shape (entries of all agents, B), into agent → (B, entries)."""
+        return {agent: observation[rows].T for agent, rows in self.slices.items()}
 
     def contents(self, quantities: Floats) -> Floats:
         """Return the part of each substance in nodes and flows, 0 where there is nothing, in rows of ``substances``."""
@@ -242,6 +249,8 @@ class ObservationLayout:
         return by_quantity, by_signal[signals.levels], by_signal[signals.seen]
 
     def _common_order(self, agents: Sequence[str], mode: str) -> tuple[str, ...]:
+        if self._has_countdown:
+            return ()
         if mode == "stocks":
             return self._network.observation.nodes
         if mode == "model" and len(agents) == 1 and self._state_rows.keys() >= set(self.names[agents[0]]):
@@ -256,13 +265,17 @@ class ObservationLayout:
         return rows[compartment]
 
     def _rows(self, agent: str, mode: str) -> Iterator[int]:
-        network, signals = self._network, self.signals
         if mode == "stocks":
-            yield from (self._state_rows[name] for name in network.observation.nodes)
-            return
-        if mode == "model":
+            yield from (self._state_rows[name] for name in self._network.observation.nodes)
+        elif mode == "model":
             yield from self._inner[agent]
-            return
+        else:
+            yield from self._rows_around(agent, mode)
+        if self._has_countdown:
+            yield self.signals.countdown
+
+    def _rows_around(self, agent: str, mode: str) -> Iterator[int]:
+        network, signals = self._network, self.signals
         compartment = network.compartments[agent]
         position = self._position[agent]
         yield position
@@ -292,8 +305,6 @@ class ObservationLayout:
             if not agents or agent in agents:
                 yield from (signals.seen.start + row for row in rows)
         yield signals.time
-        if network.observation.countdown:
-            yield signals.countdown
 
     def _arrivals(self, node: int) -> Iterator[int]:
         """Nodes into which one of fixed lifetime, such as a transport, releases: who orders ahead sees what for."""

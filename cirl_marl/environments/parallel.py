@@ -21,7 +21,7 @@ from cirl_marl.network import Floats, Network
 
 RENDER_MODES = ("rgb_array", "human")
 METADATA: dict[str, Any] = {"name": "cirl_marl", "render_modes": [*RENDER_MODES], "render_fps": 10}
-OPTIONS = ("observe", "circularity", "circularity_weight", "charges", "horizon", "uncertain")
+OPTIONS = ("observe", "countdown", "circularity", "circularity_weight", "charges", "horizon", "uncertain")
 
 
 def check_options(options: Iterable[str], choices: Sequence[str], *arguments: str) -> None:

@@ -90,6 +90,7 @@ class MultiAgentVectorEnv:
         agents: Sequence[str] | None = None,
         reward: str | None = None,
         observe: str | None = None,
+        countdown: bool | None = None,
         circularity: str = "end",
         circularity_weight: float | None = None,
         charges: Mapping[str, float] | None = None,
@@ -105,6 +106,7 @@ class MultiAgentVectorEnv:
             agents: who acts; the others hold their neutral control. None: the network's own choice.
             reward: reward mode; None takes the scenario's own, which is ``mixed`` unless the definition says otherwise.
             observe: ``local``, ``neighbours``, ``full`` or ``model``; None takes the scenario's own.
+            countdown: whether agents also see 1/(intervals left), and so the end; None takes the scenario's own.
             circularity: whether the team reward is λ at the ``end`` of the interval or its ``mean`` over it.
             circularity_weight: w in [0, 1], weight of λ in the reward; None takes the definition's.
             charges: what a unit of each account costs in rewards with λ, mass; see ``Credit``.
@@ -140,7 +142,7 @@ class MultiAgentVectorEnv:
         self.actuators = Actuators(variant, agents, num_envs, self.dynamics.factors.ranges)
         self.agents = self.actuators.agents
         self.action_spaces = self.actuators.spaces
-        self.layout = ObservationLayout(self.dynamics, self.agents, observe, num_envs)
+        self.layout = ObservationLayout(self.dynamics, self.agents, observe, num_envs, countdown)
         self.ledger = Ledger(variant, self.dynamics.factors.ranges)
         self.scoring = Scoring(self.dynamics, self.layout, self.agents, num_envs)
         self.idle = self.supply.idle(self.agents)
@@ -514,7 +516,7 @@ class MultiAgentVectorEnv:
 
     def by_agent(self, observation: NDArray[np.float32]) -> Observations:
         """Split a stacked observation, shape (entries of all agents, B), into agent → (B, entries)."""
-        return {agent: observation[rows].T for agent, rows in self.layout.slices.items()}
+        return self.layout.by_agent(observation)
 
     def _report_ends(self, infos: Infos, outcome: Outcome) -> None:
         """Add what infos say of the copies whose episode ended."""
@@ -596,15 +598,19 @@ class MultiAgentVectorEnv:
         stocks = self.rows.stocks(state.stock)
         return np.concatenate([stocks, through, state.flow, state.inner, state.measures, loads, substances])
 
-    def stacked_observation(self, table: Floats | None = None) -> NDArray[Any]:
-        """Return the present observations, shape (entries of all agents, B), by way of a ``table`` of ``layout``."""
+    def stacked_observation(self, table: Floats | None = None, layout: ObservationLayout | None = None) -> NDArray[Any]:
+        """Return the present observations, shape (entries of all agents, B), by way of a ``table`` of the ``layout``.
+
+        None is that of the environment.
+        """
+        layout = self.layout if layout is None else layout
         state = self.physical
         quantities = self.quantities(state)
         time = state.step / self.network.episode.horizon
         done = np.maximum(state.step - 1, 0)
         factors = self.dynamics.factors(state.factors, state.disturbances, done)
         levels = self.scoring.levels(quantities, done, factors)
-        return self.layout.observe(quantities, time, levels, self._sight(state), table)
+        return layout.observe(quantities, time, levels, self._sight(state), table)
 
     def _sight(self, state: State) -> Floats | None:
         """Return what the disturbances show of themselves, in the rows of ``layout.sights``; None if nothing."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,7 +24,9 @@ FEWEST = 10
 CLOSE = 0.002
 """How close the expected level of the service that lacks most has to come to what is demanded, and the expected amount
 of a budget, in parts of it, if it exceeds it."""
-TRIES = 8
+TRIES = 10
+OUTDATED = 3
+"""Tries in a row on one side of what is demanded after which the margin on the other side is no end any more."""
 FIRST_STEP, LIMITS = 0.1, (0.03, 30.0)
 """Least relative change of the first margins, and their ends."""
 
@@ -33,16 +35,18 @@ FIRST_STEP, LIMITS = 0.1, (0.03, 30.0)
 class Calibration(KeptRecord):
     """Margins and what they deliver."""
 
-    margin: Annotated[float, "by what is multiplied what the controller aims at"]
+    margin: Annotated[
+        float | tuple[float, ...], "by what is multiplied what the controller aims at: one, or by service"
+    ]
     excess: Annotated[float, "least of expected levels less what is demanded, over the draws"]
     draws: Annotated[int, "how many"]
     budget_margin: Annotated[float, "by what multipliers of budgets of an episode are multiplied"] = 1.0
     overrun: Annotated[float, "most by which such a budget is exceeded on average, in parts of it; 0 for none"] = 0.0
 
     @property
-    def margins(self) -> dict[str, float]:
+    def margins(self) -> dict[str, Any]:
         """Both as options of a controller, that on budgets where it is not 1."""
-        options = {"margin": self.margin}
+        options: dict[str, Any] = {"margin": self.margin}
         return options if self.budget_margin == 1.0 else options | {"budget_margin": self.budget_margin}
 
     @property
@@ -75,10 +79,11 @@ def calibrate(
     progress: Callable[[float], None] = lambda share: None,
     aims: Aims = NO_AIMS,
 ) -> Calibration:
-    """Return the margins at which services are closest to what is demanded on average, and budgets are kept.
+    """Return the margins at which each service is closest to what is demanded on average, and budgets are kept.
 
-    The margin on services grows or falls until it brackets the level of what lacks most, then by secants (regula
-    falsi). That on multipliers of budgets rises while an expected amount exceeds its budget.
+    The margin on a service grows or falls until it brackets that level, then by secants (regula falsi), all at once;
+    one that is delivered anyway ends at the least margin. That on multipliers of budgets rises while an expected amount
+    exceeds its budget.
 
     Args:
         env: makes so many copies.
@@ -92,41 +97,62 @@ def calibrate(
         CirlError: for too few draws, or nothing that is demanded.
     """
     check_tuning(draws, demand)
-    copies, tries, excess = env(draws), list[Calibration](), dict[float, float]()
-    margins, step, budget_step = Calibration(1.0, 0.0, draws), FIRST_STEP, FIRST_STEP
+    copies, tries = env(draws), list[tuple[float, float, Calibration]]()
+    searches, budget_margin, budget_step = [_MarginSearch() for _ in demand], 1.0, FIRST_STEP
     for done in range(TRIES):
+        values = tuple(search.margin for search in searches)
+        margins = Calibration(values[0] if len({*values}) == 1 else values, 0.0, draws, budget_margin)
         run = rollout(copies, controller(**margins.margins), seed=FIRST_DRAW)
         over = (aims.bookings(run).mean(axis=0) - aims.limits) / aims.sizes
-        overrun, margin = float(over[~aims.by_year].max(initial=0.0)), margins.margin
-        excess[margin] = float((run.episode_levels.mean(axis=0) - demand).min())
-        tries.append(replace(margins, excess=excess[margin], overrun=overrun))
+        overrun, excess = float(over[~aims.by_year].max(initial=0.0)), run.episode_levels.mean(axis=0) - demand
+        outcome = replace(margins, excess=float(excess.min()), overrun=overrun)
+        tries.append((max(CLOSE / 2, outcome.miss), float(np.abs(excess).sum()), outcome))
         progress((done + 1) / TRIES)
-        if tries[-1].miss <= CLOSE / 2:
-            break
         if overrun > CLOSE / 2:  # levels of before were at other multipliers
-            dearer = margins.budget_margin * (1.0 + max(budget_step, 2.0 * overrun))
-            margins, budget_step = replace(margins, budget_margin=dearer), 3.0 * budget_step
-            excess, step = {margin: excess[margin]}, FIRST_STEP
-        if abs(excess[margin]) > CLOSE / 2:
-            margin, step = _next_margin(excess, margin, step)
-        if not LIMITS[0] < margin < LIMITS[1]:
+            budget_margin *= 1.0 + max(budget_step, 2.0 * overrun)
+            budget_step, searches = 3.0 * budget_step, [_MarginSearch(search.margin) for search in searches]
+        moves = [search.moves(level) for search, level in zip(searches, excess.tolist(), strict=True)]
+        if overrun <= CLOSE / 2 and not any(moves):
             break
-        margins = replace(margins, margin=margin)
     progress(1.0)
-    return min(tries, key=lambda calibration: calibration.miss)
+    return min(tries, key=lambda attempt: attempt[:2])[-1]
 
 
-def _next_margin(excess: Mapping[float, float], margin: float, step: float) -> tuple[float, float]:
-    """Return what to try after a ``margin``, and the least change of the next, given the excess of those tried.
+class _MarginSearch:
+    """The search for the margin on one service, beside those for others, which change what it delivers.
 
-    It is not finite where more is aimed at and less comes about.
+    Attributes:
+        margin: what is tried next.
     """
-    low = max((m for m in excess if excess[m] < 0), default=None)
-    high = min((m for m in excess if excess[m] > 0), default=None)
-    if low is None or high is None:
-        change = max(step, 2 * abs(excess[margin]))
-        return margin * (1 + change) if high is None else margin / (1 + change), 3 * step
-    if low >= high:
-        return np.inf, step
-    share = excess[low] / (excess[low] - excess[high])
-    return low + (high - low) * float(np.clip(share, 0.15, 0.85)), step
+
+    def __init__(self, margin: float = 1.0) -> None:
+        """Begin with a margin."""
+        self.margin, self._step, self._is_settled = margin, FIRST_STEP, False
+        self._ends = dict[bool, tuple[float, float]]()  # last margin that delivers too much, or too little, and excess
+        self._run = 0  # tries between two ends, in a row, that delivered too much, or if negative too little
+
+    def moves(self, excess: float) -> bool:
+        """Go on to the next margin, given what the last delivers beyond what is demanded, if there is one to try."""
+        if abs(excess) <= CLOSE / 2:
+            self._is_settled = True
+            return False
+        margin, is_surplus, end = self.margin, excess > 0, self._ends.get(excess < 0)
+        if end is not None:
+            self._run = max(self._run, 0) + 1 if is_surplus else min(self._run, 0) - 1
+        is_stale = end is not None and (abs(self._run) == OUTDATED or (end[0] < margin) != is_surplus)
+        if self._is_settled or is_stale:
+            self._ends, self._step, self._run = {}, FIRST_STEP, 0
+        self._ends[is_surplus] = margin, excess
+        if len(self._ends) == 2:
+            (low, lack), (high, surplus) = self._ends[False], self._ends[True]
+            self.margin = low * (high / low) ** float(np.clip(lack / (lack - surplus), 0.15, 0.85))
+        else:
+            change = 1.0 + max(self._step, 2.0 * abs(excess))
+            self.margin, self._step = (
+                max(LIMITS[0], margin / change) if is_surplus else margin * change,
+                3.0 * self._step,
+            )
+        self._is_settled = self.margin == margin or self.margin >= LIMITS[1]
+        if self._is_settled:
+            self.margin = margin
+        return not self._is_settled

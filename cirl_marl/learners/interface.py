@@ -19,9 +19,11 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
+from cirl_marl.controllers.basic import Arrays
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.definitions.reader import write_network
 from cirl_marl.dynamics.adjoint import derivative_obstacle
+from cirl_marl.environments.observations import ObservationLayout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RecipeError, RunError, real_number, unknown_name, whole_number
 from cirl_marl.learners.agent_env import AgentVecEnv
@@ -81,8 +83,8 @@ def train(
         report: called after every joint step.
         device: where stacked learners compute, as torch names it.
         checkpoint_every: seconds after which a checkpoint is written; None is a minute, 0 never.
-        **options: ``scenario``, ``reward``, ``observe``, ``circularity``, ``circularity_weight``, ``horizon``,
-            ``uncertain``; they override the recipe's.
+        **options: ``scenario``, ``reward``, ``observe``, ``countdown``, ``circularity``, ``circularity_weight``,
+            ``horizon``, ``uncertain``; they override the recipe's.
 
     Returns:
         The finished training; ``learners[name].model`` is the Stable-Baselines3 model.
@@ -173,7 +175,9 @@ def _first_trainings(training: Training) -> Iterator[tuple[list[str], Training]]
     """Yield each recipe with which learners begin, to be trained in the same network and with the same seed."""
     env, config = training.env, training.config
     recipes = {name: (start.recipe, start.steps) for name, start in training.starts.items() if start.recipe}
-    options = {key: config.options[key] for key in ("observe", "horizon", "uncertain") if key in config.options}
+    options = {
+        key: config.options[key] for key in ("observe", "countdown", "horizon", "uncertain") if key in config.options
+    }
     for recipe, steps in dict.fromkeys(recipes.values()):
         names = [name for name, key in recipes.items() if key == (recipe, steps)]
         yield names, prepare(env.network, recipe, steps=steps, seed=config.seed, agents=env.agents, **options)
@@ -400,7 +404,8 @@ def export(run: str | Path | RunDirectory, folder: str | Path) -> list[Path]:
 class Trained(Policies):
     """Acts by the policies of the checkpoint that a run has chosen.
 
-    ``checkpoint`` is the folder from which they were loaded; a run that is being trained has others later.
+    Each sees what it learnt from, whatever the environment shows. ``checkpoint`` is the folder from which they were
+    loaded; a run that is being trained has others later.
     """
 
     def __init__(self, run: str | Path | RunDirectory) -> None:
@@ -414,15 +419,22 @@ class Trained(Policies):
         super().__init__(policies)
 
     def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
-        """Forget the last episode; a ``RunError`` if ``env`` has other agents, or shows them something else."""
+        """Forget the last episode; a ``RunError`` if ``env`` has other agents, or not what they learnt from."""
         if set(env.agents) != set(self._names):
             raise RunError(f"{self.run.path}: trained {sorted(self._names)}, not {sorted(env.agents)}")
+        self._env, self._layout = env, env.layout
+        if env.layout.names != self._names:
+            seen = {key: self.run.config.options.get(key) for key in ("observe", "countdown")}
+            self._layout = ObservationLayout(env.dynamics, env.agents, seen["observe"], env.num_envs, seen["countdown"])
         for agent, entries in self._names.items():
-            if (shown_here := env.layout.names[agent]) != entries:
-                counts = f"{len(shown_here)} entries, not {len(entries)}"
-                difference = next((name for name in shown_here if name not in entries), counts)
-                raise RunError(
-                    f"{self.run.path}: '{agent}' learnt from other observations than this environment's "
-                    f"({difference}); make the environment with the options of the run, as its make_env() does"
-                )
+            if (seen_here := self._layout.names[agent]) != entries:
+                counts = f"{len(seen_here)} entries, not {len(entries)}"
+                difference = next((name for name in seen_here if name not in entries), counts)
+                raise RunError(f"{self.run.path}: '{agent}' learnt from other observations ({difference})")
         super().start(env, seed)
+
+    def act(self, observations: Arrays) -> Arrays:
+        """Return each policy's deterministic action, which depends on what its agents learnt from alone."""
+        if self._layout is not self._env.layout:
+            observations = self._layout.by_agent(self._env.stacked_observation(layout=self._layout))
+        return super().act(observations)

@@ -56,8 +56,11 @@ class Settings(BaseModel):
 class Options(Settings):
     """What a recipe may say of the environment; None takes the definition's."""
 
+    LATER = ("countdown",)
+
     reward: Reward | None = None
     observe: Observe | None = None
+    countdown: StrictBool | None = None
     circularity: Moment = "end"
     circularity_weight: Annotated[Number, Field(ge=0, le=1)] | None = None
     charges: dict[StrictStr, Number] = Field(

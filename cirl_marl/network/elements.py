@@ -620,5 +620,5 @@ class Observation(CheckedRecord):
         Declaration("in mode ``stocks``, the observed stocks (ids of nodes) and inner states (``compartment.state``)"),
     ] = ()
     countdown: Annotated[
-        bool, Declaration("whether agents also see 1/(intervals left), which tells the last ones apart, in other modes")
+        bool, Declaration("whether agents also see 1/(intervals left), which tells the last ones apart")
     ] = False

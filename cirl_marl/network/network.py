@@ -19,7 +19,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
 from cirl_marl.errors import CirlError, NetworkError, check_names, unknown_name
@@ -164,6 +164,20 @@ class Network(Specification):
             if part.id.startswith(f"{region}_") and places & nodes:
                 return part.id.removeprefix(f"{region}_")
         return None
+
+    def by_service(self, name: str, values: ArrayLike, meaning: str, episodes: tuple[int, ...] = ()) -> Floats:
+        """Return numbers of services, shape (*episodes, services), of an option ``name``; one number is for every one.
+
+        Raises:
+            CirlError: for a shape that cannot be broadcast to it, with the ``meaning`` of a number.
+        """
+        shape = (*episodes, len(self.services))
+        try:
+            return np.broadcast_to(np.asarray(values, dtype=float), shape)
+        except ValueError:
+            ids = ", ".join(service.id for service in self.services) or "none"
+            message = f"{name} has shape {np.shape(values)}, expected {shape}: {meaning} for each service ({ids})"
+            raise CirlError(message) from None
 
     def region_of(self, compartment: str) -> str:
         """Return the region whose copy a compartment is of; of an arc, that of its donor before its recipient's."""

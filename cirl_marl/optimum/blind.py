@@ -84,7 +84,7 @@ class BestConstant(Planner):
         *,
         min_service: ArrayLike | None = None,
         service_weight: float | None = None,
-        margin: float = 1.0,
+        margin: ArrayLike = 1.0,
         draws: int = DRAWS,
         population: int = 48,
     ) -> None:
@@ -93,7 +93,7 @@ class BestConstant(Planner):
         Args:
             min_service: expected level demanded of every service, or of each, shape (services,), a share in [0, 1].
             service_weight: w of λ̄/circularity_scale + w·service; excludes ``min_service``.
-            margin: by what the share of each service that may lack is divided.
+            margin: by what the share of every service that may lack, or of each, shape (services,), is divided.
             draws: of which the mean counts, with seeds of their own; MORE_DRAWS times as many for a schedule.
             population: actions tried in an iteration.
 
@@ -105,26 +105,26 @@ class BestConstant(Planner):
         if draws < FEWEST:
             raise CirlError(f"draws {draws}: too few to say what is best on average, at least {FEWEST}")
         self._min_service, self._weight = min_service, service_weight
-        self._margin, self._draws, self._population = margin, draws, population
-        self._results: list[tuple[Network, dict[float, Floats]]] = []
+        self._margin, self._draws, self._population = np.asarray(margin, dtype=float), draws, population
+        self._results: list[tuple[Network, dict[tuple[float, ...], Floats]]] = []
         self.actions = np.empty((0, 0))
 
-    def with_margin(self, margin: float) -> Self:
+    def with_margin(self, margin: ArrayLike) -> Self:
         """Return one with another margin, which begins with what is found for others."""
         check_margin(margin)
         other = copy(self)
-        other._margin = margin
+        other._margin = np.asarray(margin, dtype=float)
         return other
 
     def plan(self, env: MultiAgentVectorEnv, seed: int, progress: Callable[[float], None]) -> None:
         """Look for the actions; ``seed`` has no effect."""
         if not self._results or self._results[0][0] is not env.network:
             self._results[:] = [(env.network, {})]
-        by_margin = self._results[0][1]
-        if self._margin not in by_margin:
-            nearest = min(by_margin, key=lambda margin: abs(margin - self._margin), default=None)
-            by_margin[self._margin] = self._best(env, None if nearest is None else by_margin[nearest], progress)
-        self.actions = by_margin[self._margin]
+        by_margin, margins = self._results[0][1], env.network.by_service("margin", self._margin, "a margin")
+        if (key := tuple(margins.tolist())) not in by_margin:
+            nearest = min(by_margin, key=lambda place: np.abs(place - margins).max(initial=0.0), default=None)
+            by_margin[key] = self._best(env, None if nearest is None else by_margin[nearest], progress)
+        self.actions = by_margin[key]
         self._replay = Replay(self.actions)
         self._replay.start(env, seed)
 
@@ -138,7 +138,8 @@ class BestConstant(Planner):
         """Return the expected levels that are aimed at, shape (services,)."""
         if self._min_service is None:
             return None
-        return 1.0 - (1.0 - demanded_levels(network, self._min_service)) / self._margin
+        lack = 1.0 - demanded_levels(network, self._min_service)
+        return 1.0 - lack / network.by_service("margin", self._margin, "a margin")
 
     def act(self, observations: Arrays) -> Arrays:
         """Return the actions of the interval."""

@@ -184,7 +184,7 @@ class MPC(Planner):
         degree: int = 1,
         replan: int | None = None,
         futures: int | None = None,
-        margin: float = 1.0,
+        margin: ArrayLike = 1.0,
         budget_margin: float = 1.0,
         prices: Prices | None = None,
         delay: int = 0,
@@ -205,7 +205,7 @@ class MPC(Planner):
             futures: how many are drawn at every decision in a disturbed network; None: one, in which all is as it is
                 expected to be.
             margin: by what the demanded bands of services are multiplied in plans, or in a disturbed network what is
-                charged for service that lacks.
+                charged for service that lacks; of every service, or of each, shape (services,).
             budget_margin: by what the multipliers of budgets of a disturbed episode are multiplied.
             prices: of a bound for who does not foresee (``bound(…, uncertain=True)``): a plan then looks a single
                 interval ahead, and what stocks are worth after it follows the states of the disturbances.
@@ -245,11 +245,12 @@ class MPC(Planner):
 
         Raises:
             NoCertificate: for a network whose flows are not linear laws; see ``bound``.
-            CirlError: for another number of demanded levels than services.
+            CirlError: for another number of demanded levels, or of margins, than services.
         """
         network, (horizon, replan, futures) = env.network, self._options
         self._aims = aims = aims_of(network, self._aim, self._at_most)
         self._levels = None if self._min_service is None else demanded_levels(network, self._min_service)
+        margins = network.by_service("margin", self._margin, "a margin")
         self._climbs = any(service.substance for service in network.services)
         self.note, self._env, is_disturbed = "", env, bool(network.disturbed)
         if self._prices is not None and len(self._prices.service) > len(network.services):
@@ -283,9 +284,9 @@ class MPC(Planner):
                 multipliers = self._prices.service
             if self._levels is not None:
                 least = LEAST_PRICE * network.objective.circularity_scale
-                self._price = self._margin * np.maximum(multipliers, least)
+                self._price = margins * np.maximum(multipliers, least)
                 if self._climbs:
-                    self._price = self._margin * outlook.task.price[len(aims.budgets) :]
+                    self._price = margins * outlook.task.price[len(aims.budgets) :]
         self._plans = []
         self._look_ahead(range(env.num_envs))
         for copy in range(env.num_envs):

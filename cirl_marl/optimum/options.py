@@ -101,13 +101,7 @@ def demanded_levels(network: Network, min_service: ArrayLike, episodes: tuple[in
     Raises:
         CirlError: for a shape that cannot be broadcast to it.
     """
-    shape = (*episodes, len(network.services))
-    try:
-        return np.broadcast_to(np.asarray(min_service, dtype=float), shape)
-    except ValueError:
-        ids = ", ".join(service.id for service in network.services) or "none"
-        message = f"min_service has shape {np.shape(min_service)}, expected {shape}: a level for each service ({ids})"
-        raise CirlError(message) from None
+    return network.by_service("min_service", min_service, "a level", episodes)
 
 
 def levels_text(network: Network, levels: Floats) -> str:
@@ -123,23 +117,28 @@ def lack_texts(network: Network, demand: Floats, levels: Floats) -> list[str]:
     return [f"{lack:.4f} less of '{service.id}'" for service, lack in lacks if lack > NOTABLE]
 
 
-def check_margin(margin: float, name: str = "margin") -> None:
-    """Refuse a margin, which an option ``name`` has, that is not positive and finite.
+def check_margin(margin: ArrayLike, name: str = "margin") -> None:
+    """Refuse margins, which an option ``name`` has, that are not positive and finite.
 
     Raises:
-        CirlError: naming it.
+        CirlError: naming the first of them.
     """
-    if not 0 < margin < math.inf:
-        raise CirlError(f"{name} {margin!r} must be positive and finite")
+    for number in np.ravel(margin).tolist():
+        if not isinstance(number, int | float) or not 0 < number < math.inf:
+            raise CirlError(f"{name} {number!r} must be positive and finite")
 
 
-def with_margin(network: Network, margin: float) -> Network:
-    """Return a certain network whose services want ``margin`` times as much, and limits of contents as much less."""
-    if margin == 1.0:
+def with_margin(network: Network, margin: ArrayLike) -> Network:
+    """Return a certain network whose services want ``margin`` times as much, and limits of contents as much less.
+
+    Raises:
+        CirlError: for another number of margins than services.
+    """
+    margins = network.by_service("margin", margin, "a margin")
+    if (margins == 1.0).all():
         return network
-    factors = (1.0 / margin if service.substance else margin for service in network.services)
     services = (
-        replace(s, low=product(s.low, margin), high=product(s.high, factor))
-        for s, factor in zip(network.services, factors, strict=True)
+        replace(s, low=product(s.low, factor), high=product(s.high, 1.0 / factor if s.substance else factor))
+        for s, factor in zip(network.services, margins.tolist(), strict=True)
     )
     return network.variant(services=tuple(services))

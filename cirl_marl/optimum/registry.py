@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from cirl_marl.controllers.basic import Constant, Controller, Neutral, Random
@@ -13,6 +14,7 @@ from cirl_marl.controllers.lqr import LQR
 from cirl_marl.controllers.scripted import ScriptController
 from cirl_marl.errors import CirlError, unknown_name
 from cirl_marl.network.elements import CIRCULARITY, is_of_circularity
+from cirl_marl.optimum.options import check_margin
 
 if TYPE_CHECKING:
     from cirl_marl.optimum.aims import Aim
@@ -42,7 +44,7 @@ def named_controller(
     min_service: ArrayLike | None = None,
     smooth: bool | None = False,
     gap: float | None = None,
-    margin: float = 1.0,
+    margin: ArrayLike = 1.0,
     budget_margin: float = 1.0,
     futures: int | None = None,
     prices: Prices | None = None,
@@ -58,7 +60,8 @@ def named_controller(
             as can be had.
         smooth: whether the plans of ``optimum`` are to change little; see ``Optimum``.
         gap: that its plans may have to the bound; see ``Optimum``.
-        margin: by what those of TUNABLE multiply what they aim at, or divide what may lack.
+        margin: by what those of TUNABLE multiply what they aim at, or divide what may lack; of every service, or of
+            each, shape (services,).
         budget_margin: by what ``mpc`` and ``scenario_mpc`` multiply what budgets of a disturbed episode cost.
         futures: that ``scenario_mpc`` plans for; None: FUTURES.
         prices: of a bound for who does not foresee, which ``price_policy`` needs.
@@ -74,7 +77,8 @@ def named_controller(
         raise CirlError(f"values of single agents go with {' or '.join(SETTABLE)} control, not with {name}")
     if min_service is not None and name not in PLANNERS:
         raise CirlError(f"a demanded service level goes with {', '.join(PLANNERS)} control, not with {name}")
-    if margin != 1.0 and name not in TUNABLE:
+    check_margin(margin)
+    if np.any(np.asarray(margin) != 1.0) and name not in TUNABLE:
         raise CirlError(f"a margin goes with {', '.join(TUNABLE)} control, not with {name}")
     if futures is not None and name != "scenario_mpc":
         raise CirlError(f"futures go with scenario_mpc control, not with {name}")
@@ -125,7 +129,7 @@ def controllers_by_margin(name: str, **options: Any) -> Callable[..., Controller
 def _planner(
     name: str,
     min_service: ArrayLike | None,
-    margin: float,
+    margin: ArrayLike,
     futures: int | None,
     prices: Prices | None,
     aims: Mapping[str, Any],

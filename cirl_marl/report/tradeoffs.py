@@ -17,6 +17,7 @@ from cirl_marl.evaluation.episode_count import EPISODES_DISTURBED, MOST_EPISODES
 from cirl_marl.evaluation.figures import provenance
 from cirl_marl.evaluation.pareto import ParetoFront
 from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, Aggregate, finite_or_none, interquartile_mean
+from cirl_marl.network import Network
 from cirl_marl.records.files import publish_result
 from cirl_marl.report.curves import PointSeries, save_fronts
 from cirl_marl.report.terminal import text_table
@@ -91,7 +92,9 @@ def comparison_notes(comparison: Comparison) -> list[str]:
     by_name = {row.name: row.entries[0].calibration for row in comparison.rows}
     calibrations = {name: calibration for name, calibration in by_name.items() if calibration is not None}
     if calibrations:
-        margins = [f"{name} {_margins_text(calibration)}" for name, calibration in calibrations.items()]
+        margins = [
+            f"{name} {_margins_text(calibration, comparison.network)}" for name, calibration in calibrations.items()
+        ]
         notes.append(f"margins, set on other draws: {', '.join(margins)}")
     for name, calibration in calibrations.items():
         if calibration.overrun > CLOSE:
@@ -201,10 +204,15 @@ def _headers(comparison: Comparison) -> list[str]:
     return [words[name] for name in comparison.figures]
 
 
-def _margins_text(calibration: Calibration) -> str:
-    """Return the margin, and that on budgets where they are dearer."""
-    budgets = calibration.budget_margin
-    return f"{calibration.margin:.4g}" + (f" (of budgets {budgets:.4g})" if budgets != 1.0 else "")
+def _margins_text(calibration: Calibration, network: Network) -> str:
+    """Return the margins, and that on budgets where they are dearer."""
+    budgets, margin = calibration.budget_margin, calibration.margin
+    if isinstance(margin, tuple):
+        parts = zip(network.services, margin, strict=True)
+        text = ", ".join(f"{factor:.4g} of '{service.id}'" for service, factor in parts)
+    else:
+        text = f"{margin:.4g}"
+    return text + (f" (of budgets {budgets:.4g})" if budgets != 1.0 else "")
 
 
 def _milliseconds(row: Row) -> float:

@@ -76,7 +76,7 @@ def controller_of(
         if "actions" in arrays:
             return Replay(arrays["actions"].astype(np.float64)), {}
         if "margin" in description:
-            window = {"horizon": description["horizon"], "margin": float(description["margin"])}
+            window = {"horizon": description["horizon"], "margin": np.asarray(description["margin"], dtype=float)}
             return MPC(min_service=task.min_service, **window), {}
     except (KeyError, TypeError, ValueError) as error:
         raise RunError(f"{path}: is not what {algorithm} acts by: {error!r}") from error

@@ -36,8 +36,6 @@ def setting_problems(network: Specification) -> Iterator[str]:
     yield from unknown_names("compartment with a set_point", objective.tracked, with_set_point, "objective.tracked: ")
     if (network.observation.mode == "stocks") != bool(network.observation.nodes):
         yield "observation: mode 'stocks', and only that mode, lists its nodes"
-    if network.observation.countdown and network.observation.mode in ("stocks", "model"):
-        yield f"observation: mode '{network.observation.mode}' shows nothing else, so no countdown"
     inner = [f"{c.id}.{name}" for c in compartments if c.model is not None for name in c.model.state_names]
     signals = dict.fromkeys((*(node.id for node in network.nodes), *inner))
     yield from unknown_names("node or inner state", network.observation.nodes, signals, "observation: ")
