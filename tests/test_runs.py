@@ -283,14 +283,15 @@ def test_policies_of_others_are_refused(own_copper_run: Path) -> None:
 def test_policies_act_on_what_they_learnt_to_see(copper_run: Path) -> None:
     """Whatever an environment shows; a network in which they would see something else is refused."""
     policy = Trained(copper_run)
+    other = cirl_marl.load_network("copper_net")
+    showing = other.with_options(observation={"mode": "full", "countdown": True})
     runs = [
-        rollout(MultiAgentVectorEnv("copper_net", num_envs=2, horizon=3, **shown), policy, seed=0)
-        for shown in ({}, {"observe": "full"}, {"countdown": True})
+        rollout(MultiAgentVectorEnv(network, num_envs=2, horizon=3, **shown), policy, seed=0)
+        for network, shown in ((other, {}), (other, {"observe": "full"}), (other, {"countdown": True}), (showing, {}))
     ]
     for run in runs[1:]:
         np.testing.assert_array_equal(run.stock, runs[0].stock)
         np.testing.assert_array_equal(run.controls, runs[0].controls)
-    other = cirl_marl.load_network("copper_net")
     other = replace(other, nodes=tuple(replace(node, set_point=1.0) for node in other.nodes))
     with pytest.raises(RunError, match=r"learnt from other observations \(set-point of"):
         policy.start(MultiAgentVectorEnv(other, num_envs=2), seed=0)

@@ -133,6 +133,8 @@ class ObservationLayout:
     """Which signals each agent sees, in which order, within which bounds.
 
     Attributes:
+        mode: what of the network is shown.
+        countdown: whether the intervals left are shown, too.
         slices: rows of each agent in the stacked observation.
         names: what each entry of an agent's observation is.
         array_order: stocks and inner states in the order in which all agents observe them and nothing else; empty if
@@ -145,8 +147,8 @@ class ObservationLayout:
     ) -> None:
         """Lay out the observations of ``agents``; ``mode`` and ``countdown`` None take the network's own."""
         network = dynamics.network
-        self._has_countdown = network.observation.countdown if countdown is None else bool(countdown)
-        mode = network.observation.mode if mode is None else mode
+        self.countdown = network.observation.countdown if countdown is None else bool(countdown)
+        self.mode = mode = network.observation.mode if mode is None else mode
         check_names("observation mode", [mode], OBSERVE, "observe: ")
         if mode == "stocks" and not network.observation.nodes:
             raise CirlError(f"observe: mode 'stocks' needs a scenario that lists the nodes; '{network.name}' has none")
@@ -214,7 +216,7 @@ class ObservationLayout:
         with np.errstate(over="ignore"):
             np.multiply(quantities, self._inverse_scale, out=table[: self.signals.quantities], casting="same_kind")
         table[self.signals.time] = time
-        if self._has_countdown:
+        if self.countdown:
             table[self.signals.countdown] = 1.0 / np.maximum(self._network.episode.horizon * (1.0 - time), 1.0)
         table[self.signals.levels] = levels
         if sight is not None:
@@ -249,7 +251,7 @@ class ObservationLayout:
         return by_quantity, by_signal[signals.levels], by_signal[signals.seen]
 
     def _common_order(self, agents: Sequence[str], mode: str) -> tuple[str, ...]:
-        if self._has_countdown:
+        if self.countdown:
             return ()
         if mode == "stocks":
             return self._network.observation.nodes
@@ -271,7 +273,7 @@ class ObservationLayout:
             yield from self._inner[agent]
         else:
             yield from self._rows_around(agent, mode)
-        if self._has_countdown:
+        if self.countdown:
             yield self.signals.countdown
 
     def _rows_around(self, agent: str, mode: str) -> Iterator[int]:

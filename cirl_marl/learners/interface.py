@@ -413,7 +413,7 @@ class Trained(Policies):
         self.run = run if isinstance(run, RunDirectory) else RunDirectory(run)
         self.checkpoint = folder = self.run.acting_checkpoint
         env = self.run.make_env(1)
-        self._names = env.layout.names
+        self._names, self._shown = env.layout.names, (env.layout.mode, env.layout.countdown)
         groups = self.run.groups()
         policies = {group.name: load_acting_learner(folder, group, env).policy for group in groups}
         super().__init__(policies)
@@ -424,8 +424,8 @@ class Trained(Policies):
             raise RunError(f"{self.run.path}: trained {sorted(self._names)}, not {sorted(env.agents)}")
         self._env, self._layout = env, env.layout
         if env.layout.names != self._names:
-            seen = {key: self.run.config.options.get(key) for key in ("observe", "countdown")}
-            self._layout = ObservationLayout(env.dynamics, env.agents, seen["observe"], env.num_envs, seen["countdown"])
+            mode, countdown = self._shown
+            self._layout = ObservationLayout(env.dynamics, env.agents, mode, env.num_envs, countdown)
         for agent, entries in self._names.items():
             if (seen_here := self._layout.names[agent]) != entries:
                 counts = f"{len(seen_here)} entries, not {len(entries)}"
