@@ -321,7 +321,11 @@ BAD: dict[str, tuple[dict[str, str], str]] = {
     "unknown task": ({"task": "paper_cty-v0"}, r"row 2: unknown task .*Did you mean 'paper_city-v0'"),
     "no number": ({"gap": "small"}, "row 2: gap 'small' is no number"),
     "infinite": ({"gap": "inf"}, "row 2: gap is inf"),
-    "no variant": ({"variant": "9"}, "held-out variants are"),
+    "no variant": ({"variant": "9"}, "results.csv: row 2: task .* held-out variants are"),
+    "no episodes": ({"episodes": "0"}, "row 2: episodes must be a whole number of at least 1, got 0"),
+    "too many episodes": ({"episodes": "99"}, r"row '.*/ppo/401': task .* has 64 episodes, got episodes 99"),
+    "negative seed": ({"seed": "-1"}, "row 2: seed must be"),
+    "only a variant": ({"variant": "1"}, "has no rows but those of held-out variants to rerun"),
 }
 
 
@@ -355,6 +359,13 @@ def test_bad_tables_and_files_are_named(trained: Path, tmp_path: Path) -> None:
     table.write_text("a,b\n1,2\n")
     with pytest.raises(RunError, match="has the columns a, b"):
         read_rows(table)
+    table.write_text("")
+    with pytest.raises(RunError, match="has the columns ; a table of results has task, variant"):
+        read_rows(table)
+    add_rows(tmp_path / "marked.csv", [row])
+    marked = (tmp_path / "marked.csv").read_bytes()
+    (tmp_path / "marked.csv").write_bytes(b"\xef\xbb\xbf" + marked)
+    assert read_rows(tmp_path / "marked.csv") == [row]
     with pytest.raises(RunError, match="no such table"):
         read_rows(tmp_path / "none.csv")
     with pytest.raises(RunError, match="take smaller policies"):
@@ -473,6 +484,35 @@ def test_measure_takes_policies_of_ones_own() -> None:
     figures = load_task(TASK).measure(Neutral(), episodes=3)
     assert figures.gap.value > 0
     assert 0 < figures.service.value <= 1
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"horizon": 3}, "has no bound of other episodes: horizon 3, not 91"),
+        ({"scenario": "breakdowns"}, "has no bound of other episodes: scenario 'breakdowns', not 'default'"),
+        ({"episodes": 65}, "has 64 episodes, got episodes 65"),
+        ({"episodes": 0}, "episodes must be a whole number of at least 1"),
+    ],
+)
+def test_a_bound_is_held_against_its_episodes_alone(options: dict[str, Any], message: str) -> None:
+    """Others, of which it proves nothing, are refused."""
+    with pytest.raises(CirlError, match=message):
+        load_task(TASK).measure(Neutral(), **{"episodes": 2, **options})
+
+
+def test_weights_are_measured_in_the_episodes_of_the_task(trained: Path, tmp_path: Path) -> None:
+    """However long those were in which they learnt; schedules of other agents are refused."""
+    table = changed(trained, tmp_path)
+    (row,) = read_rows(table)
+    arrays, description = read_weights(tmp_path / row.weights)
+    description["config"]["options"] |= {"horizon": 3, "circularity_weight": 0.5}
+    add_rows(table, [replace(row, sha256=write_weights(tmp_path / row.weights, arrays, description))])
+    assert verify(table) == [row.id]
+    sha256 = write_weights(tmp_path / row.weights, {"actions": np.zeros((1, 4), dtype=np.float32)}, {})
+    add_rows(table, [replace(row, sha256=sha256)])
+    with pytest.raises(RunError, match=rf"row '{row.id}': a schedule of \S+ has shape \(steps, 3\), got \(1, 4\)"):
+        verify(table)
 
 
 def test_a_bound_of_draws_is_one_file(tmp_path: Path) -> None:

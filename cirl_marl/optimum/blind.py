@@ -57,7 +57,10 @@ class Replay(Controller):
         self.actions = actions
 
     def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
-        """Begin with the first."""
+        """Begin with the first; a ``ControlError`` says that they are of other agents."""
+        entries = sum(space.shape[0] for space in env.action_spaces.values())
+        if self.actions.ndim != 2 or not len(self.actions) or self.actions.shape[1] != entries:
+            raise ControlError(f"a schedule of {env} has shape (steps, {entries}), got {self.actions.shape}")
         self._env = env
 
     def act(self, observations: Arrays) -> Arrays:

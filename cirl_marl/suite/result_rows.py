@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from filelock import FileLock
 
-from cirl_marl.errors import RunError, check_names
+from cirl_marl.errors import CirlError, RunError, check_names, whole_number
 from cirl_marl.network.declarations import KeptRecord, frozen_record
 from cirl_marl.records.files import sha256_of, write_table
 from cirl_marl.suite.tasks import CONTROLLERS, PACKAGE_DATA, BenchmarkTask, Figures, load_task, tasks
@@ -83,8 +84,8 @@ def read_rows(path: Path = KEPT_RESULTS) -> list[ResultRow]:
     """
     names = [field.name for field in fields(ResultRow)]
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            header, *lines = list(csv.reader(file))
+        with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets begin files with a mark
+            header, *lines = list(csv.reader(file)) or [[]]
     except FileNotFoundError:
         raise RunError(f"{path}: no such table of results") from None
     except (OSError, ValueError, csv.Error) as error:
@@ -98,8 +99,8 @@ def read_rows(path: Path = KEPT_RESULTS) -> list[ResultRow]:
             raise RunError(f"{place}: has {len(line)} cells, not {len(names)}")
         row = ResultRow(**{name: _cell(place, name, text) for name, text in zip(names, line, strict=True)})
         check_names("task", [row.task], tasks(), f"{place}: ", RunError)
-        if row.variant:
-            load_task(row.task).held_out(row.variant)
+        with _placing(place):
+            task_of(row)
         if rows.setdefault(key_of(row), row) is not row:
             raise RunError(f"{place}: '{row.id}', variant {row.variant}, is there already")
     return [*rows.values()]
@@ -112,6 +113,16 @@ NUMBERS: Mapping[str, Callable[[str], Any]] = {
     "episodes": int,
     **dict.fromkeys(FORMS, float),
 }
+LEAST = {"seed": 0, "steps": 0, "episodes": 1}
+
+
+@contextmanager
+def _placing(place: str) -> Iterator[None]:
+    """Say where what cannot be used stands."""
+    try:
+        yield
+    except CirlError as error:
+        raise RunError(f"{place}: {error}") from error
 
 
 def _cell(place: str, name: str, text: str) -> Any:
@@ -119,6 +130,9 @@ def _cell(place: str, name: str, text: str) -> Any:
         value = NUMBERS.get(name, str)(text)
     except ValueError:
         raise RunError(f"{place}: {name} '{text}' is no number") from None
+    if name in LEAST and value is not None:
+        with _placing(place):
+            whole_number(name, value, LEAST[name])
     if name in ("circularity", "service", "gap") and not math.isfinite(value):
         raise RunError(f"{place}: {name} is {text}")
     return value
@@ -158,13 +172,14 @@ def verify(path: Path = KEPT_RESULTS, ids: Sequence[str] = (), *, variants: bool
 
     Raises:
         CirlError: for an id that the table does not have.
-        RunError: for weights that are missing or others than the row's, or figures that a rerun does not give; it names
-            file, row, column and both values.
+        RunError: for a table without such rows, weights that are missing or others than the row's, or figures that a
+            rerun does not give; it names file, row, column and both values.
     """
-    rows = read_rows(path)
-    row_ids = {row.id for row in rows}
-    check_names("row", ids, row_ids, f"{path}: ")
-    selection = [row for row in rows if (not ids or row.id in ids) and (variants or not row.variant)]
+    rows = [row for row in read_rows(path) if variants or not row.variant]
+    if not rows:
+        raise RunError(f"{path}: has no rows{'' if variants else ' but those of held-out variants'} to rerun")
+    check_names("row", ids, [row.id for row in rows], f"{path}: ")
+    selection = [row for row in rows if not ids or row.id in ids]
     for row in selection:
         _verify(path, row)
     return [row.id for row in selection]
@@ -180,8 +195,9 @@ def _verify(path: Path, row: ResultRow) -> None:
             raise RunError(f"{place}: its weights are missing: {weights}")
         if (actual := sha256_of(weights)) != row.sha256:
             raise RunError(f"{place}: {weights} has another SHA-256, {actual}, than the row, {row.sha256}")
-    controller, options = controller_of(task, row.algorithm, weights)
-    figures = columns_of(task.measure(controller, episodes=row.episodes, **options))
+    with _placing(place):
+        controller, options = controller_of(task, row.algorithm, weights)
+        figures = columns_of(task.measure(controller, episodes=row.episodes, **options))
     for name, now in figures.items():
         if not is_reproduced(row, name, now):
             digits, rerun = (FORMS[name].format(figure) for figure in (getattr(row, name), now))

@@ -18,7 +18,8 @@ from cirl_marl.definitions.ids import NAMESPACE
 from cirl_marl.definitions.overrides import overlay
 from cirl_marl.definitions.reader import read_toml
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, RunError, check_names, unknown_name
+from cirl_marl.errors import CirlError, RunError, check_names, unknown_name, whole_number
+from cirl_marl.evaluation.contenders import differences
 from cirl_marl.evaluation.statistics import SHARE, Aggregate, over_episodes
 from cirl_marl.learners.recipe import Recipe, load_recipe
 from cirl_marl.network import Network
@@ -121,8 +122,16 @@ class BenchmarkTask:
             controller: the policy, as ``rollout`` takes it.
             episodes: only the first so many; None: all.
             **options: of ``vector_env``, such as ``observe``: what the policy is used to.
+
+        Raises:
+            CirlError: for more episodes than the task has, or options by which they are others than those of its bound.
         """
-        run = rollout(self.env(episodes, **options), controller, seed=first_seed(self.seed))
+        if episodes is not None and whole_number("episodes", episodes, 1) > self.episodes:
+            raise CirlError(f"task '{self.name}': has {self.episodes} episodes, got episodes {episodes}")
+        env = self.env(episodes, **options)
+        if mismatches := "; ".join(differences(env, self.env(1, agents=env.agents))):
+            raise CirlError(f"task '{self.name}': has no bound of other episodes: {mismatches}")
+        run = rollout(env, controller, seed=first_seed(self.seed))
         levels = run.episode_levels
         lowest = levels[:, levels.mean(axis=0).argmin()] if levels.shape[1] else np.ones(len(levels))
         gaps = self.bound().gaps(run.episode_circularity, levels)

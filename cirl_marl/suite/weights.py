@@ -58,7 +58,7 @@ def read_weights(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
 def controller_of(
     task: BenchmarkTask, algorithm: str, path: Path | None, folder: Path | None = None
 ) -> tuple[Controller, dict[str, Any]]:
-    """Return who acted in a row, and the options of the environment that show what it is used to.
+    """Return who acted in a row, and as options of the environment for which agents.
 
     Args:
         task: the task, or a variant of it.
@@ -90,5 +90,4 @@ def controller_of(
         run = rebuild_run(folder, arrays, description, load_task(task.name).network())
     except RunError as error:
         raise RunError(f"{path}: {error}") from error
-    config = run.config
-    return Trained(run), {**config.options, "agents": config.agents}
+    return Trained(run), {"agents": run.config.agents}
