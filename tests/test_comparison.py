@@ -229,6 +229,10 @@ def test_bad_input(bottles: Network, runs: list[Path]) -> None:
         compare([], ["mcp"], network=bottles)
     with pytest.raises(CirlError, match="must be distinct"):
         compare([], ["random", "random"], network=bottles)
+    with pytest.raises(
+        CirlError, match=r"tune 10: none of \['neutral', 'lqr'\] has a margin; add one of scripted, mpc"
+    ):
+        compare([], ["lqr"], network=bottles, min_service=0.9, tune=10)
     with pytest.raises(CirlError, match="at least 2"):
         compare(runs, episodes=1)
     with pytest.raises(RunError, match="the same recipe and seed 0"):

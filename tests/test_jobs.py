@@ -39,6 +39,8 @@ def test_jobs_are_done_once(tmp_path: Path) -> None:
     assert [(each.name, each.state, each.share) for each in seen[-1]] == [(name, "done", 1.0) for name in "abc"]
     assert run_jobs(jobs, tmp_path / "jobs") == []
     assert [job.file.read_text() for job in jobs] == ["1", "0", "1"]
+    with pytest.raises(CirlError, match=r"asked for more than once: b$"):
+        run_jobs([*jobs, jobs[1]], tmp_path / "jobs")
 
 
 def test_who_fails_is_named_and_the_others_go_on(tmp_path: Path) -> None:

@@ -322,6 +322,10 @@ def test_margins_are_set_on_draws_of_their_own() -> None:
     assert calibrate(env, lambda margin: Shifted(1.0), np.ones(1), 10).excess < -0.05
     with pytest.raises(CirlError, match="tune 3: too few draws"):
         calibrate(env, Shifted, demand, 3)
+    assert calibrate(env, Shifted, float(demand[0]), 40) == result
+    for level, message in ((np.nan, "min_service nan must lie in"), ([0.9, 0.9], r"shape \(2,\), expected \(1,\)")):
+        with pytest.raises(CirlError, match=message):
+            calibrate(env, Shifted, level, 10)
     for draws, message in ((10.5, "tune must be a whole number"), (10**7, "more draws than seeds set apart")):
         with pytest.raises(CirlError, match=message):
             calibrate(env, Shifted, demand, draws)  # type: ignore[arg-type]

@@ -13,9 +13,9 @@ from cirl_marl.controllers.basic import Controller
 from cirl_marl.controllers.rollout import SEED_SPACING, rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, whole_number
-from cirl_marl.network import Floats
 from cirl_marl.network.declarations import KeptRecord, positional_record
 from cirl_marl.optimum.aims import NO_AIMS, Aims
+from cirl_marl.optimum.options import check_service, demanded_levels
 
 FIRST_DRAW = 2**30 + 2**20
 """First seed of the draws; no evaluation has it."""
@@ -59,7 +59,7 @@ def check_tuning(draws: int, demand: ArrayLike | None) -> None:
     """Refuse what no margin can be set by, before anything is computed.
 
     Raises:
-        CirlError: for too few draws, or nothing that is demanded.
+        CirlError: for too few draws, nothing that is demanded, or what is no level.
     """
     if whole_number("tune", draws, 0) < FEWEST:
         raise CirlError(f"tune {draws}: too few draws to tell an expected level, at least {FEWEST}")
@@ -69,12 +69,13 @@ def check_tuning(draws: int, demand: ArrayLike | None) -> None:
         raise CirlError("tune: give min_service, to which expected levels are tuned")
     if not np.size(demand):
         raise CirlError("tune: there is no service of which a level is demanded")
+    check_service(demand)
 
 
 def calibrate(
     env: Callable[[int], MultiAgentVectorEnv],
     controller: Callable[..., Controller],
-    demand: Floats,
+    demand: ArrayLike,
     draws: int,
     progress: Callable[[float], None] = lambda share: None,
     aims: Aims = NO_AIMS,
@@ -88,16 +89,17 @@ def calibrate(
     Args:
         env: makes so many copies.
         controller: makes it with a ``margin``, and where there are budgets of the episode with a ``budget_margin``.
-        demand: expected level demanded of each service, shape (services,).
+        demand: expected level demanded of every service, or of each, shape (services,), in [0, 1].
         draws: on which it is tuned.
         progress: called with the share that is done.
         aims: have the budgets; those of years, which hold in each copy, are left out.
 
     Raises:
-        CirlError: for too few draws, or nothing that is demanded.
+        CirlError: as ``check_tuning`` does, or for another number of levels than services.
     """
     check_tuning(draws, demand)
     copies, tries = env(draws), list[tuple[float, float, Calibration]]()
+    demand = demanded_levels(copies.network, demand)
     searches, budget_margin, budget_step = [_MarginSearch() for _ in demand], 1.0, FIRST_STEP
     for done in range(TRIES):
         values = tuple(search.margin for search in searches)

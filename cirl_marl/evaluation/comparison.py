@@ -28,6 +28,7 @@ from cirl_marl.network.elements import CIRCULARITY
 from cirl_marl.optimum import NoCertificate, gap
 from cirl_marl.optimum.aims import NO_AIMS, Aims, aims_of
 from cirl_marl.optimum.options import demanded_levels, levels_text
+from cirl_marl.optimum.registry import TUNABLE
 from cirl_marl.optimum.uncertain_bound import UncertainBound
 
 FIGURES = ("circularity", "gain", "service", "bound", "gap")
@@ -267,6 +268,8 @@ def compare(
     demand = None if min_service is None else demanded_levels(env.network, min_service)
     if tune is not None:
         check_tuning(tune, demand)
+        if not any(candidate.is_tunable for candidate in candidates):
+            raise CirlError(f"tune {tune}: none of {list(controls)} has a margin; add one of {', '.join(TUNABLE)}")
     if uncertain_bound is not None:
         _check_bound(uncertain_bound, env, demand)
         episodes, seed = _draws_of(uncertain_bound, episodes, seed), uncertain_bound.sampling.seed

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -127,7 +128,8 @@ class _Driver:
     def __init__(self, jobs: Sequence[Job], folder: Path, watch: Watch) -> None:
         self._files = {job.name: JobFiles(folder, job.name) for job in jobs}
         if len(self._files) != len(jobs):
-            raise CirlError("jobs must have distinct names")
+            repeated = [name for name, count in Counter(job.name for job in jobs).items() if count > 1]
+            raise CirlError(f"jobs must have distinct names; asked for more than once: {', '.join(repeated)}")
         self._states: dict[str, JobState] = {job.name: "done" if job.is_done() else "waiting" for job in jobs}
         self._queue = [job for job in jobs if self._states[job.name] == "waiting"]
         self._at_work: dict[str, tuple[Job, Worker]] = {}
