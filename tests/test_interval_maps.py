@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from small_networks import small
 
 from benchmarks.yearly import Family, yearly_network
+from cirl_marl import Arc, Control, ControlKind, Law, Service
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.optimum import slopes
 from cirl_marl.optimum.aims import NO_AIMS
@@ -46,6 +50,41 @@ def test_maps_of_intervals_are_what_quotients_come_to(
     monkeypatch.setattr(slopes, "has_interval_maps", lambda dynamics: False)
     monkeypatch.setattr(slopes, "DIFFERENCE", 1e-7)
     quotients = slopes.jacobians(plan, dynamics)
-    for entries, of_quotients in ((exact.by_stock, quotients.by_stock), (exact.by_action, quotients.by_action)):
-        np.testing.assert_allclose(entries, of_quotients, rtol=0, atol=3e-4 * abs(of_quotients).max())
+    assert_alike(exact, quotients, 3e-4)
     np.testing.assert_array_equal(exact.end, quotients.end)
+
+
+def assert_alike(exact: slopes.Slopes, quotients: slopes.Slopes, tolerance: float) -> None:
+    """Compare derivatives relative to the largest."""
+    for entries, of_quotients in ((exact.by_stock, quotients.by_stock), (exact.by_action, quotients.by_action)):
+        np.testing.assert_allclose(entries, of_quotients, rtol=0, atol=tolerance * abs(of_quotients).max())
+
+
+def test_supplies_share_what_is_left_with_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A supply from a mine that runs dry brings more, if it is asked for more, at the cost of an order from there."""
+    order = Control(kind=ControlKind.FLOW, low=0.0, neutral=5.0, high=10.0)
+    supply = Control(kind=ControlKind.FLOW, low=0.0, neutral=0.0, high=30.0)
+    network = small(
+        {"mine": 12.0, "use": 10.0, "shop": 3.0, "tip": 0.0},
+        [
+            Arc(id="order", donor="mine", recipient="shop", law=Law.CONTROLLED, control=order),
+            Arc(id="sales", donor="shop", recipient="tip", rate=2.0),
+            Arc(id="wear", donor="use", recipient="tip", rate=0.8),
+            Arc(id="supply", donor="mine", recipient="use", law=Law.CONTROLLED, control=supply),
+        ],
+        interval=2.0,
+        horizon=1,
+    )
+    network = replace(
+        network,
+        arcs=(*network.arcs[:-1], replace(network.arcs[-1], makes_up_for="held")),
+        services=(Service(id="held", provider="use", quantity="stock", low=3.5),),
+        default_agents=("order",),
+    )
+    plan = WindowActions(network, ("order",), network.initial[0], np.full((1, 1), 0.6), None, NO_AIMS)
+    dynamics = Dynamics(network)
+    exact = slopes.jacobians(plan, dynamics)
+    mine, use, *_ = exact.end[0]
+    assert dynamics.substeps > 2 and mine < 1e-9 and use == pytest.approx(3.5)
+    monkeypatch.setattr(slopes, "has_interval_maps", lambda dynamics: False)
+    assert_alike(exact, slopes.jacobians(plan, dynamics), 1e-4)

@@ -3,7 +3,8 @@
 While rates hold, a substep is linear in its stocks x and in the scheduled flows φ asked for, x' = M x + G φ, and so is
 what moves, m = F x + H φ. With the φ of an interval below its stocks, z = (x, φ) goes through n substeps as W^n z, by
 repeated squaring, where difference quotients would go through all of them for every stock. Where φ_k is cut it is
-c_k x_d, with x_d the stock of its donor: other columns of W, in the substeps in which that is so.
+c_k x_d, with x_d the stock of its donor: other columns of W, in the substeps in which that is so. Flows that are cut
+share what their donor can deliver, c_k = p φ_k/Σφ: what is asked for more of one, the others lose.
 """
 
 from __future__ import annotations
@@ -45,32 +46,36 @@ class IntervalMaps:
             By stocks at the start, shape (steps, rows, stocks), and by flows that ``arcs`` are asked for, likewise.
         """
         dynamics, (stocks, steps) = self._dynamics, (self._dynamics.rows.nodes.stop, stock.shape[1])
-        start, is_cut, per_stock = self._start(), *self._limits(stock, rate)
+        start, is_cut, factor, per_stock = self._start(), *self._limits(stock, rate)
         response = np.empty((steps, stocks + len(dynamics.network.arcs), len(start)))
         for t in range(steps):
             substep, state, transfer = self._substep(rate[:, [t]]), start, np.zeros((1, 1))
             # substeps in which the same flows are cut
             changes = np.flatnonzero((is_cut[1:, :, t] != is_cut[:-1, :, t]).any(axis=1)) + 1
             for run in np.split(np.arange(dynamics.substeps), changes):
-                of_run = self._with_limits(substep, is_cut[run[0], :, t], per_stock[run[0], :, t])
+                limits = is_cut[run[0], :, t], per_stock[run[0], :, t]
+                of_run = self._with_limits(substep, *limits)
+                shared = self._shares(substep, of_run, *limits, factor[run, :, t]) @ state[stocks:]
                 whole, through = _power(of_run[:stocks], of_run[stocks:], len(run))
-                transfer, state = transfer + through @ state, whole @ state
+                transfer, state = transfer + through @ state + shared[stocks:], whole @ state
+                state[:stocks] += shared[:stocks]
             response[t] = np.concatenate([state[:stocks], transfer / dynamics.network.episode.control_interval])
         return response[:, :, :stocks], response[:, :, stocks:]
 
-    def _limits(self, stock: Floats, rate: Floats) -> tuple[Bools, Floats]:
-        """Return ``ScheduledFlows.limits`` in each substep, shape (substeps, arcs, steps) each."""
+    def _limits(self, stock: Floats, rate: Floats) -> tuple[Bools, Floats, Floats]:
+        """Return what is cut in each substep, by what factor, and c, shape (substeps, arcs, steps) each."""
         dynamics, routes, rate = self._dynamics, self._dynamics.routing.routes(rate), rate.copy()
         if dynamics.slots is not None:
             stock = dynamics.slots.shift_slots(stock)
             dynamics.slots.set_outflows(stock, rate)
-        is_cut, per_stock = np.empty((2, dynamics.substeps, len(self.arcs), stock.shape[1]))
+        is_cut, factor, per_stock = np.empty((3, dynamics.substeps, len(self.arcs), stock.shape[1]))
         assert dynamics.taylor is not None
         for j in range(dynamics.substeps if len(self.arcs) else 0):
-            is_cut[j], per_stock[j] = dynamics.scheduled.limits(stock, rate)
+            is_cut[j], part = dynamics.scheduled.limits(stock, rate)
+            factor[j], per_stock[j] = part * stock[self._donors], part * rate[self.arcs]
             transfer = dynamics.taylor.moved_mass(stock, routes, None, dynamics.scheduled.cut(stock, rate))
             stock = dynamics.incidence.add_to(stock.copy(), transfer)
-        return is_cut.astype(bool), per_stock
+        return is_cut.astype(bool), factor, per_stock
 
     def _substep(self, rate: Floats) -> Floats:
         """Return M and G, and below them F and H, of an interval with rates of shape (arcs, 1)."""
@@ -93,6 +98,23 @@ class IntervalMaps:
             response[:, self._donors[k]] += per_stock[k] * substep[:, stocks + k]
             response[:, stocks + k] = 0.0
         return response
+
+    def _shares(self, substep: Floats, of_run: Floats, is_cut: Bools, per_stock: Floats, factor: Floats) -> Floats:
+        """Return how stocks and flows change in substeps in which the same flows are cut with what these are asked for.
+
+        With s = φ_k/Σφ it is ∂(c_k x_d)/∂φ_j = factor·(δ_kj − s), which is 0 for the only flow of a donor.
+        """
+        stocks, result = self._dynamics.rows.nodes.stop, np.zeros((len(substep), len(self.arcs)))
+        is_together = self._donors[:, None] == self._donors
+        cut = np.flatnonzero(is_cut & (is_together.sum(axis=0) > 1))
+        is_together = is_together[np.ix_(cut, cut)]
+        share = per_stock[cut] / (is_together @ per_stock[cut])
+        by_flow = substep[:, stocks + cut] @ (np.eye(len(cut)) - is_together * share[:, None])
+        for now in factor[:, cut] if len(cut) else ():
+            change = by_flow * now + of_run[:, :stocks] @ result[:stocks, cut]
+            change[stocks:] += result[stocks:, cut]
+            result[:, cut] = change
+        return result
 
     def _start(self) -> Floats:
         """Return z at the start of an interval: slots move on, and what comes out of them is asked for."""

@@ -131,12 +131,12 @@ class ScheduledFlows:
         return rate
 
     def limits(self, stock: Floats, rate: Floats) -> tuple[Bools, Floats]:
-        """Return which of ``arcs`` are cut, and what each then is of its donor's stock, 1/time, shape (arcs, B)."""
+        """Return which of ``arcs`` are cut, and by what each then is, per stock of its donor, shape (arcs, B)."""
         demand, turned_over = self._demand(rate)
         deliverable = _deliverable(turned_over) * KEPT
         is_cut = demand > self._stocks(stock) * deliverable
         part = np.divide(deliverable, demand, out=np.zeros_like(demand), where=is_cut)
-        return is_cut.take(self._slot, axis=0), rate[self.arcs] * part.take(self._slot, axis=0)
+        return is_cut.take(self._slot, axis=0), part.take(self._slot, axis=0)
 
     def pull_back(self, stock: Floats, rate: Floats, adjoint: Floats, stock_adjoint: Floats) -> None:
         """Turn, in place, the adjoint of the rates that ``cut`` returned into that of those it was given.
