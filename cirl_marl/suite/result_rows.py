@@ -99,7 +99,7 @@ def read_rows(path: Path = KEPT_RESULTS) -> list[ResultRow]:
             raise RunError(f"{place}: has {len(line)} cells, not {len(names)}")
         row = ResultRow(**{name: _cell(place, name, text) for name, text in zip(names, line, strict=True)})
         check_names("task", [row.task], tasks(), f"{place}: ", RunError)
-        with _placing(place):
+        with _error_place(place):
             task_of(row)
         if rows.setdefault(key_of(row), row) is not row:
             raise RunError(f"{place}: '{row.id}', variant {row.variant}, is there already")
@@ -117,7 +117,7 @@ LEAST = {"seed": 0, "steps": 0, "episodes": 1}
 
 
 @contextmanager
-def _placing(place: str) -> Iterator[None]:
+def _error_place(place: str) -> Iterator[None]:
     """Say where what cannot be used stands."""
     try:
         yield
@@ -131,7 +131,7 @@ def _cell(place: str, name: str, text: str) -> Any:
     except ValueError:
         raise RunError(f"{place}: {name} '{text}' is no number") from None
     if name in LEAST and value is not None:
-        with _placing(place):
+        with _error_place(place):
             whole_number(name, value, LEAST[name])
     if name in ("circularity", "service", "gap") and not math.isfinite(value):
         raise RunError(f"{place}: {name} is {text}")
@@ -195,7 +195,7 @@ def _verify(path: Path, row: ResultRow) -> None:
             raise RunError(f"{place}: its weights are missing: {weights}")
         if (actual := sha256_of(weights)) != row.sha256:
             raise RunError(f"{place}: {weights} has another SHA-256, {actual}, than the row, {row.sha256}")
-    with _placing(place):
+    with _error_place(place):
         controller, options = controller_of(task, row.algorithm, weights)
         figures = columns_of(task.measure(controller, episodes=row.episodes, **options))
     for name, now in figures.items():
