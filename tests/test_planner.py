@@ -10,7 +10,7 @@ from typing import Any, cast
 import highspy
 import numpy as np
 import pytest
-from small_networks import cycle
+from small_networks import cycle, small
 
 from cirl_marl import (
     Account,
@@ -169,6 +169,24 @@ def test_a_step_is_corrected_until_services_are_kept() -> None:
     for rounds in (1, 2):
         run = simulate_plan(improve_plan(found, rounds=rounds))
         assert run.episode_levels.min() >= 0.99 - 1e-4
+
+
+@pytest.mark.parametrize(("stock", "sales"), [(10.0, 8.0), (25.0, 12.0)])
+def test_plans_keep_services_whose_price_the_bound_underrates(stock: float, sales: float) -> None:
+    """It lets a shop sell less and so hold more, where the simulator has it sell as long as there is anything."""
+    supply = Control(kind=ControlKind.FLOW, low=0.0, neutral=0.0, high=30.0)
+    network = small(
+        {"mine": 200.0, "shop": stock, "tip": 0.0},
+        [
+            Arc(id="supply", donor="mine", recipient="shop", law=Law.CONTROLLED, control=supply),
+            Arc(id="sales", donor="shop", recipient="tip", law=Law.EXOGENOUS, flow=sales),
+        ],
+    )
+    mine, *others = network.nodes
+    service = Service(id="held", provider="shop", quantity="stock", low=15.0)
+    nodes = (replace(mine, role=Role.NONRENEWABLE_RESERVOIR), *others)
+    run = simulate_plan(improve_plan(bound(replace(network, nodes=nodes, services=(service,)), min_service=0.9)))
+    assert run.episode_levels.min() >= 0.9 - 1e-4
 
 
 def test_the_best_of_a_round_counts_and_what_it_lacks_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -53,7 +53,8 @@ uniform ones 3; three miss it where sources have 800 t in place of 600."""
 LEAP = 2.0
 """Half-width of the trust region, all of the range, of a step to what is not made any more, as it is too impure."""
 DEARER = 10.0
-"""By what prices of what is short rise where no step helps: beside contents and budgets the bound knows low ones."""
+"""By what prices of what is short rise where no step helps: beside contents, budgets and flows that the simulator cuts
+only from empty donors the bound knows low ones."""
 STALL = 0.05
 """Part of what is charged for what is short, which a step has to gain if prices are to stay there."""
 EXTENSION = 3
@@ -76,10 +77,10 @@ def improve_plan(
     """Return ``bound`` with actions that do better in the simulator; the bound and its certificate stay.
 
     Plans are compared by the objective of the bound; what each service lacks of ``min_service`` is charged PENALTY
-    times what the bound says it costs to provide. Local optimality is all that is sought; ``bound.gap`` says how much
-    better any plan could be. With services of contents, whose products with flows have many local optima, random
-    actions are begun from as well (``starts``). Of a network so large that its Jacobians would have more than
-    MOST_SLOPES entries the plan is made by ``refine``, whatever ``rounds`` is.
+    times what the bound says it costs to provide, and more where it stays short. Local optimality is all that is
+    sought; ``bound.gap`` says how much better any plan could be. With services of contents, whose products with flows
+    have many local optima, random actions are begun from as well (``starts``). Of a network so large that its Jacobians
+    would have more than MOST_SLOPES entries the plan is made by ``refine``, whatever ``rounds`` is.
 
     Args:
         bound: with the actions to start from.
@@ -100,7 +101,7 @@ def improve_plan(
     for start, actions in enumerate(starting_actions(bound.actions, starts)):
         report = partial(_tell, progress, start, starts)
         first = replace(bound, actions=actions)
-        plan, _ = climb(first, trials, prices(bound), rounds, enough, report, least_gain=least_gain)
+        plan, _ = climb(first, trials, prices(bound), rounds, enough, report, least_gain=least_gain, demand_first=True)
         plans.append(plan)
     if starts == 1:
         return plans[0]
@@ -151,10 +152,12 @@ def climb(
     progress: Callable[[float], None] = lambda share: None,
     *,
     least_gain: float = NO_PROMISE,
+    demand_first: bool = False,
 ) -> tuple[P, Floats]:
     """Return a plan with better actions, by linear programs around episodes, from its own, and the last prices.
 
-    Where contents are demanded or there are budgets, prices rise of what is short and no step helps.
+    Where contents are demanded or there are budgets, or with ``demand_first``, prices rise of what is short and no step
+    helps.
 
     Args:
         plan: with the actions to start from.
@@ -165,6 +168,7 @@ def climb(
         enough: asked of each episode that is better than those before, whether to stop there.
         progress: called with the share of rounds that are done.
         least_gain: as in ``improve_plan``.
+        demand_first: whether what is demanded comes before the price that it has at first.
     """
     dynamics, demand, aims, price = Dynamics(plan.network), trials.demand, plan.aims, price.copy()
     lack, excess = np.zeros(len(demand)), np.zeros(len(aims.budgets))
@@ -172,13 +176,14 @@ def climb(
     value, trust, slopes = trials.value(run, price), TRUST, None
     has_contents, is_leap = any(service.substance for service in plan.network.services), False
     is_cheap = has_contents or bool(aims.budgets)
+    may_rise = is_cheap or demand_first
     nearest, nearest_shortfall = plan, _total_shortage(demand, aims, run)
     shortfall = nearest_shortfall
     for done in range(EXTENSION * rounds if is_cheap else rounds):
         is_short = np.append(demand - run.episode_levels[0], aims.excess(run) / aims.sizes) > TOLERATED_SHORTFALL
         if done >= rounds and not is_short.any():
             break
-        if trust < SMALLEST and is_cheap and is_short.any():
+        if trust < SMALLEST and may_rise and is_short.any():
             is_leap = has_contents and not is_leap
             trust = LEAP
             if not is_leap:
@@ -210,7 +215,7 @@ def climb(
         else:
             trust = 0.0 if is_leap or not any(steps) else trust / 4
     progress(1.0)
-    return (nearest if is_cheap and shortfall > nearest_shortfall else best), price
+    return (nearest if may_rise and shortfall > nearest_shortfall else best), price
 
 
 @positional_record
