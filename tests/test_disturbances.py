@@ -26,6 +26,9 @@ from cirl_marl import (
     MultiAgentVectorEnv,
     Network,
     NetworkError,
+    Node,
+    Role,
+    Service,
     bound,
     load_network,
     parallel_env,
@@ -406,3 +409,27 @@ def test_lifetimes_are_disturbed_unless_they_are_fixed() -> None:
         NetworkError, match=r"nodes.store.stretch: only a lifetime with a deviation can be .* disturbed"
     ):
         living(Lifetime(mean=2.0, distribution="fixed"))
+
+
+def test_what_stands_still_all_the_time_is_a_network() -> None:
+    """In a draw a node may release nothing and a service ask for nothing, so that it has a bound; a file may not."""
+    on = DisturbanceEffect(by="on")
+    network = Network(
+        name="shop",
+        nodes=(Node(id="shop", initial=(9.0, 9.0), rate=0.5), Node(id="tip", role=Role.LANDFILL, initial=(0.0, 0.0))),
+        arcs=(Arc(id="sales", donor="shop", recipient="tip", law=Law.SHARE),),
+        services=(Service(id="held", provider="shop", quantity="stock", low=5.0),),
+        episode=Episode(horizon=3),
+        disturbances={"on": Markov(values=(1.0, 0.0), lengths=(2.0, 4.0))},
+        disturbed={"nodes.shop.rate": on, "services.held.low": on},
+    )
+    env = MultiAgentVectorEnv(network, num_envs=8)
+    env.reset(seed=0)
+    still = (env.physical.disturbances[:-1] == 0).all(axis=(0, 1))
+    assert still.any() and not still.all()
+    for copy in np.flatnonzero(still):
+        certain = env.certain_network(copy)
+        assert bound(certain, min_service=1.0).objective == pytest.approx(0.0, abs=1e-6)
+        for field in ("nodes", "services"):
+            with pytest.raises(NetworkError, match=r"shares what it releases|asks for nothing"):
+                replace(network, **{field: getattr(certain, field)}, disturbances={}, disturbed={})

@@ -48,7 +48,7 @@ class Specification:
         scenario_name: the scenario that this network describes.
         scenarios: the other scenarios of the same definition, by name.
         is_variant: whether it is what another network is under other options, or in a draw; limits of contents that the
-            other could keep are no mistakes of such a one.
+            other could keep are no mistakes of such a one, nor are rates and demands that a draw takes to 0.
     """
 
     name: str

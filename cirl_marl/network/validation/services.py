@@ -75,7 +75,7 @@ def _service_problems(
     elif not ((low >= 0) & (low <= high) & (high > 0)).all():
         worst = int(np.argmin((low >= 0) & (low <= high) & (high > 0)))
         yield f"{subject}: the band [{low[worst]}, {high[worst]}] must not be negative or empty"
-    elif (low == 0).all() and np.isinf(high).all():
+    elif (low == 0).all() and np.isinf(high).all() and not network.is_variant:
         yield f"{subject}: the band from 0 without an upper end asks for nothing"
 
 

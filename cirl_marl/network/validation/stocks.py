@@ -40,7 +40,8 @@ def storage_problems(network: Specification, node: Node, outflows: Sequence[Arc]
             yield f"{subject}: initial: missing; {rule}, and '{proportional[0]}' is not"
         if node.lifetime is not None:
             return
-        if bool(shares) != (extremes(node.rate)[1] > 0):
+        has_rate = extremes(node.rate)[1] > 0 or (bool(shares) and network.is_variant)  # a draw may stop it
+        if bool(shares) != has_rate:
             remedy = "give the node a rate, 1/time, a lifetime, or stores = false"
             remedy_ = (
                 f"arc '{shares[0]}' shares what it releases; {remedy}" if shares else "it is for arcs of law 'share'"
