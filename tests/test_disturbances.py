@@ -427,7 +427,7 @@ def test_what_stands_still_all_the_time_is_a_network() -> None:
     env.reset(seed=0)
     still = (env.physical.disturbances[:-1] == 0).all(axis=(0, 1))
     assert still.any() and not still.all()
-    for copy in np.flatnonzero(still):
+    for copy in np.flatnonzero(still).tolist():
         certain = env.certain_network(copy)
         assert bound(certain, min_service=1.0).objective == pytest.approx(0.0, abs=1e-6)
         for field in ("nodes", "services"):
