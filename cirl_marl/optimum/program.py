@@ -36,11 +36,12 @@ from cirl_marl.optimum.constraints import (
     valve_envelopes,
 )
 from cirl_marl.optimum.content_ranges import check_contents
+from cirl_marl.optimum.decay import decay_rows
 from cirl_marl.optimum.effort import charged_controls, effort_rows, largest_distances
 from cirl_marl.optimum.excess import excess_rows
 from cirl_marl.optimum.matrices import BEFORE, NOW, ChainedRows, IntervalCache, Layout, ProgramRows, RowParts
 from cirl_marl.optimum.mixtures import content_rows, mixture_rows
-from cirl_marl.optimum.quasi_steady import decay_rows, end_laws, has_fast_stocks, quasi_steady_rows
+from cirl_marl.optimum.quasi_steady import end_laws, has_fast_stocks, quasi_steady_rows
 from cirl_marl.optimum.reach import ComparisonSystem, Reach
 from cirl_marl.optimum.shortages import shortage_rows
 from cirl_marl.optimum.transit import ConstantShares, Transit, steady_rows
