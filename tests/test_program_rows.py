@@ -578,6 +578,27 @@ def test_a_furnace_that_is_fed_by_schedule_is_known(rate: float) -> None:
         assert end == pytest.approx(4.0 / rate + (2.0 - 4.0 / rate) * math.exp(-rate), rel=1e-6)
 
 
+@pytest.mark.parametrize("merged", [False, True])
+@pytest.mark.parametrize("leak", [1e-9, 9e-7, 1.1e-6])
+def test_a_pile_that_hardly_leaks_is_fed_by_schedule(leak: float, merged: bool) -> None:
+    """Of what enters a part is lost that is far below the rest, and far above round-off."""
+    network = Network(
+        name="pile",
+        nodes=(
+            Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR, initial=(500.0, 500.0)),
+            Node(id="pile", initial=(1e-3, 1e-3)),
+            Node(id="river", initial=(1.0, 1.0)),
+        ),
+        arcs=(
+            Arc(id="dumping", donor="mine", recipient="pile", law=Law.EXOGENOUS, flow=100.0),
+            Arc(id="leak", donor="pile", recipient="river", rate=leak),
+        ),
+        episode=Episode(control_interval=1.0, horizon=2),
+    )
+    for degree in (1, 2, 3):
+        assert_holds(play(network, np.random.default_rng(degree), "inside"), degree, None, merged)
+
+
 @pytest.mark.parametrize(("degree", "below", "above"), [(1, 0.11, 0.22), (2, 0.02, 0.025)])
 def test_what_enters_a_stock_in_the_middle_of_a_merged_piece_is_left(degree: int, below: float, above: float) -> None:
     """A furnace in which metal stays about as long as a merged piece is, behind a stock that gives ever less."""

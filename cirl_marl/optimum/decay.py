@@ -72,9 +72,10 @@ class _DecayChains:
         i, self.turnovers = np.arange(d + 1), rate * layout.length
         turnover = self.turnovers[:, None]
         self.means = np.concatenate([_decay_means(self.turnovers, d), np.exp(-turnover)], axis=1)
-        # x + U·s in place of x + U (1 − e^{−ks})/k serves for every k ≥ 0, and is a little weaker
-        slow = np.broadcast_to(np.append((i + 1) / (d + 2), 1.0) * layout.length, self.means.shape)
-        self.delays = np.divide(1.0 - self.means, rate[:, None], out=slow.copy(), where=turnover >= 1e-6)
+        # where this cancels, the mean of s − ks²/2; what follows is below round-off
+        first, second = np.append((i + 1) / (d + 2), 1.0), np.append((i + 1) * (i + 2) / ((d + 2) * (d + 3)), 1.0)
+        slow = (first - turnover * second / 2) * layout.length
+        self.delays = np.divide(1.0 - self.means, rate[:, None], out=slow, where=turnover >= 1e-6)
         self.layout, self.rows = layout, rows
         self.first = np.arange(layout.pieces) * (d + 1)  # moment of each piece
         network, arcs, shape = ranges.network, np.flatnonzero(ranges.by_schedule), (len(rate), len(ranges.driver))
