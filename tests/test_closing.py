@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 from typing import Any
 
@@ -62,6 +63,39 @@ def test_no_time_is_time_for_the_first_bound(degrees: list[int]) -> None:
     assert degrees == [1]
     np.testing.assert_array_equal(found.bound.actions, bound(SHORT, min_service=0.95, degree=1, tight=True).actions)
     assert found.gap > 0.01
+
+
+@pytest.mark.parametrize(
+    ("pieces", "seconds", "begun"),
+    [
+        (2, 56.0, [1]),
+        (2, 57.0, [1, 2]),
+        (2, 70.0, [1, 2]),
+        (2, 71.0, [1, 2, 3]),
+        (1, 127.0, [1, 2]),
+        (1, 128.0, [1, 2, 3]),
+    ],
+)
+def test_a_bound_is_begun_if_it_can_be_had_in_time(
+    pieces: int, seconds: float, begun: list[int], degrees: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each takes 20 s; the next one 1.8 or 1.5 times as long, by 3/2 or 4/3 of the moments, 4.4 if a piece is added."""
+    clock, recorded = [0.0], closing.bound
+    monkeypatch.setattr(closing.time, "process_time", lambda: clock[0])
+
+    def timed(*network: Any, degree: int, **options: Any) -> Bound:
+        clock[0] += 20.0
+        solution: Bound = recorded(*network, degree=1, **options)
+        layout = copy(solution.problem.layout)
+        layout.pieces, layout.moments = pieces, range(pieces * (degree + 1))
+        degrees[-1] = degree
+        return replace(solution, problem=replace(solution.problem, layout=layout))
+
+    monkeypatch.setattr(closing, "bound", timed)
+    monkeypatch.setattr(closing, "improve_plan", lambda solution, **options: solution)
+    monkeypatch.setattr(closing, "_gap", lambda solution, run: 1.0)
+    close_gap(SHORT, seconds=seconds, degrees=(1, 2, 3), min_service=0.95)
+    assert degrees == begun
 
 
 def test_a_solver_that_fails_takes_nothing_back(monkeypatch: pytest.MonkeyPatch) -> None:

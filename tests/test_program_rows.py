@@ -599,6 +599,31 @@ def test_a_pile_that_hardly_leaks_is_fed_by_schedule(leak: float, merged: bool) 
         assert_holds(play(network, np.random.default_rng(degree), "inside"), degree, None, merged)
 
 
+@pytest.mark.parametrize(("fed", "asked"), [(0.0, 30.0), (40.0, 0.0), (10.0, 25.0), (0.0, 2000.0)])
+def test_schedules_of_a_heap_in_a_merged_piece(fed: float, asked: float) -> None:
+    """What schedules take from a stock that leaks, or bring, counts while it leaks; the last one empties it."""
+    network = Network(
+        name="heap",
+        nodes=(
+            Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR, initial=(500.0, 500.0)),
+            Node(id="heap", initial=(300.0, 300.0)),
+            Node(id="river", initial=(1.0, 1.0)),
+            Node(id="builder", initial=(0.0, 0.0)),
+        ),
+        arcs=(
+            Arc(id="feed", donor="mine", recipient="heap", law=Law.EXOGENOUS, flow=fed),
+            Arc(id="order", donor="heap", recipient="builder", law=Law.EXOGENOUS, flow=asked),
+            Arc(id="leak", donor="heap", recipient="river", rate=0.9),
+        ),
+        episode=Episode(control_interval=1.0, horizon=2, solver_step=0.25),
+    )
+    played = play(network, np.random.default_rng(0), "inside")
+    assert played.cut == (asked == 2000.0)
+    for degree in (1, 2):
+        assert Programs(Admissible.of(network), degree, None, merge_pieces=True).layout.pieces == 1
+        assert_holds(played, degree, None, merged=True)
+
+
 @pytest.mark.parametrize(("degree", "below", "above"), [(1, 0.11, 0.22), (2, 0.02, 0.025)])
 def test_what_enters_a_stock_in_the_middle_of_a_merged_piece_is_left(degree: int, below: float, above: float) -> None:
     """A furnace in which metal stays about as long as a merged piece is, behind a stock that gives ever less."""

@@ -305,6 +305,11 @@ def possible_range(
     ), lifetime_flow
 
 
+def fewest_pieces(degree: int) -> int:
+    """Return how few pieces of an interval are left, however many are merged."""
+    return max(degree - 1, 1)
+
+
 def _layout(
     admissible: Admissible,
     substeps: int,
@@ -329,7 +334,7 @@ def _layout(
         fewer *= MERGED * large / variables
     if merge_pieces is None and entries > LARGE_KERNELS:
         fewer = min(fewer, pieces * math.sqrt(LARGE_KERNELS / entries))
-    fewer_pieces = max(int(fewer), degree - 1, 1)
+    fewer_pieces = max(int(fewer), fewest_pieces(degree))
     if pieces <= fewer_pieces:
         return fine
     length = network.episode.control_interval / fewer_pieces
