@@ -294,8 +294,9 @@ def test_runs_that_do_not_fit(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     """A run of another network, a plan of a run under a controller, a recipe of other agents: nothing is written."""
     bottles()
     options = ("--recipe", "independent_a2c", "--steps", "320", "--envs", "8", "--episodes", "2", "--out", "run")
-    assert run(monkeypatch, "train", "bottles.toml", "--agents", "quarry", *options) == 0
-    assert json.loads(Path("run/config.json").read_text())["agents"] == ["quarry"]
+    assert run(monkeypatch, "train", "bottles.toml", "--agents", "quarry", "--countdown", *options) == 0
+    config = json.loads(Path("run/config.json").read_text())
+    assert config["agents"] == ["quarry"] and config["options"]["countdown"] is True
     assert run(monkeypatch, "plan", "run", "--out", "plan.csv") == 0
     assert Path("plan.csv").read_text().startswith("from (day),to (day),quarry: valve factor (1),")
     assert run(monkeypatch, "compare", "run", "--episodes", "2", "--out", "compared") == 0

@@ -181,12 +181,12 @@ def test_cells_are_named_by_their_content(asked: Path) -> None:
 def test_a_cell_is_a_training_and_its_evaluation(asked: Path) -> None:
     """With the bits of ``train`` and the figures of ``compare``; who watches sees steps and the gap to the bound."""
     changed(changed(asked, "seeds = [0, 1]", "seeds = 1"), "[0.2, 0.8]", "0.2")
-    changed(asked, "bounds = false", "bounds = true")
+    changed(changed(asked, "bounds = false", "bounds = true"), "[options]", "[options]\ncountdown = true")
     seen: list[CellStatus] = []
     found = sweep(asked, on="here", watch=lambda statuses: seen.extend(statuses))
     (row,) = found.rows
     run = found.folder / "cells" / row["cell"] / "run"
-    train("bottles.toml", "quick.toml", directory="alone", seed=1, circularity_weight=0.2)
+    train("bottles.toml", "quick.toml", directory="alone", seed=1, circularity_weight=0.2, countdown=True)
     assert files(run) == files(Path("alone"))
     entry = compare([run], ["neutral"], episodes=2).entries[0]
     assert entry.run is not None and entry.gap is not None
@@ -195,6 +195,7 @@ def test_a_cell_is_a_training_and_its_evaluation(asked: Path) -> None:
     assert row["circularity"] == pytest.approx(entry.circularity.mean())
     assert row["service"] == pytest.approx(entry.service.mean())
     assert (row["unit"], row["circularity_weight"], row["steps"], row["no_bound"]) == ("t", 0.2, 160, None)
+    assert row["countdown"] is True
     assert seen[-1].job_status.state == "done" and seen[-1].gap == pytest.approx(gap.value)
     with (found.folder / "sweep.csv").open(newline="") as file:
         (kept,) = csv.DictReader(file)

@@ -60,6 +60,9 @@ def train(
     observe: Annotated[
         str | None, typer.Option(help=f"{common.OBSERVE}; default: the recipe's, else the definition's.")
     ] = None,
+    countdown: Annotated[
+        bool | None, typer.Option(help="Whether agents see how many intervals are left; default: as for observe.")
+    ] = None,
     uncertain: common.Uncertain = None,
     out: Annotated[Path | None, typer.Option(help="Run directory; default: runs/NETWORK-RECIPE-seedN.")] = None,
     resume: Annotated[
@@ -84,7 +87,7 @@ def train(
     options: dict[str, Any] = {"steps": steps, "envs": envs, "scenario": scenario, "reward": reward, "engine": engine}
     options |= {"min_service": min_service, "uncertain": uncertain, "checkpoint_every": checkpoint_every}
     names = None if agents is None else common.comma_separated(agents)
-    options |= {"observe": observe, "agents": names, "device": device}
+    options |= {"observe": observe, "countdown": countdown, "agents": names, "device": device}
     all_seeds = range(seed, seed + seeds)
     if resume is None and recipe is None:
         recipe = interface.default_recipe(load_network(str(network), scenario=scenario))

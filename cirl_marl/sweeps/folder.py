@@ -150,7 +150,7 @@ class SweepFolder:
         raise RunError(f"{self.path}: {other}, {count}; choose another folder. Nothing was changed")
 
 
-_ENVIRONMENT = {key: key for key in ("reward", "observe", "circularity_weight", "horizon", "uncertain")}
+_ENVIRONMENT = {key: key for key in ("reward", "observe", "countdown", "circularity_weight", "horizon", "uncertain")}
 _ENVIRONMENT |= {"circularity": "circularity_in_reward"}  # circularity itself is a result
 OPTION_COLUMNS = tuple(_ENVIRONMENT.get(name, name) for name in SweepOptions.model_fields)
 """Columns of the options of a sweep file, in its order."""

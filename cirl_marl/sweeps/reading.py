@@ -47,6 +47,7 @@ class SweepOptions(Settings):
     min_service: NonEmptyList[Level] | None = None
     reward: NonEmptyList[Reward] | None = None
     observe: NonEmptyList[Observe] | None = None
+    countdown: NonEmptyList[StrictBool] | None = None
     circularity: NonEmptyList[Moment] | None = None
     circularity_weight: NonEmptyList[Level] | None = None
     horizon: NonEmptyList[Count] | None = None
