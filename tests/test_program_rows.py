@@ -47,7 +47,6 @@ from cirl_marl.network.series import Series
 from cirl_marl.network.split_fractions import splits
 from cirl_marl.optimum import NoCertificate, bound
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.decay import contact_weights
 from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.program import Program, Programs
 from cirl_marl.optimum.quasi_steady import cut_responses
@@ -622,60 +621,6 @@ def test_schedules_of_a_heap_in_a_merged_piece(fed: float, asked: float) -> None
     for degree in (1, 2):
         assert Programs(Admissible.of(network), degree, None, merge_pieces=True).layout.pieces == 1
         assert_holds(played, degree, None, merged=True)
-
-
-@pytest.mark.parametrize(("degree", "below", "above"), [(1, 0.11, 0.22), (2, 0.02, 0.025)])
-def test_what_enters_a_stock_in_the_middle_of_a_merged_piece_is_left(degree: int, below: float, above: float) -> None:
-    """A furnace in which metal stays about as long as a merged piece is, behind a stock that gives ever less."""
-    network = Network(
-        name="foundry",
-        nodes=(
-            Node(id="yard", initial=(9.0, 9.0)),
-            Node(id="furnace", initial=(2.0, 2.0)),
-            Node(id="tip", role=Role.LANDFILL, initial=(1.0, 1.0)),
-        ),
-        arcs=(
-            Arc(id="charge", donor="yard", recipient="furnace", rate=0.9),
-            Arc(id="slag", donor="furnace", recipient="tip", rate=1.7),
-        ),
-        episode=Episode(control_interval=1.0, horizon=1),
-    )
-    programs = Programs(Admissible.of(network), degree, None, merge_pieces=True)
-    problem, last = programs.program(network.initial[1]), programs.layout.last.start + network.node_index["furnace"]
-    exact = 2.0 * math.exp(-1.7) + 8.1 * (math.exp(-0.9) - math.exp(-1.7)) / 0.8
-    ends = [
-        float(solve(replace(problem, cost=sign * (np.arange(len(problem.cost)) == last))).plan[last])
-        for sign in (1.0, -1.0)
-    ]
-    assert exact * (1 - below) < ends[0] <= exact <= ends[1] < exact * (1 + above)
-
-
-@pytest.mark.parametrize("turnover", [1e-6, 0.3, 1.9])
-@pytest.mark.parametrize(("degree", "i"), [(d, i) for d in range(1, 5) for i in range(d)])
-def test_rows_hold_and_touch_whenever_it_enters(degree: int, i: int, turnover: float) -> None:
-    """Of 1 that enters at t, or is there at the start, and falls at most at a rate, at that or not at all."""
-    (weights,), (start,), (end,) = contact_weights(np.array([turnover]), degree, i)
-    nodes, shares = np.polynomial.legendre.leggauss(30)
-    binomials = np.array([math.comb(degree, j) for j in range(degree + 1)])
-
-    def excess(entry: float, rate: float) -> float:
-        s = entry + (1 - entry) * (nodes + 1) / 2
-        bernstein = (
-            (degree + 1)
-            * binomials
-            * s[:, None] ** np.arange(degree + 1)
-            * (1 - s[:, None]) ** np.arange(degree, -1, -1)
-        )
-        mean = (1 - entry) / 2 * shares * np.exp(-rate * (s - entry)) @ bernstein @ weights
-        return float(mean + (start if entry == 0 else 0.0) - end * math.exp(-rate * (1 - entry)))
-
-    middle = (i + 1) / (degree + 1)
-    falls = np.array([excess(entry, turnover) for entry in np.linspace(0, 1, 41)])
-    assert falls.max() <= 1e-13
-    assert falls.min() < -1e-3
-    assert excess(middle, turnover) == pytest.approx(0.0, abs=1e-13)
-    assert falls[0] == pytest.approx(0.0, abs=1e-13)
-    assert max(excess(entry, 0.0) for entry in np.linspace(0, 1, 41)) <= 1e-13
 
 
 @pytest.mark.medium

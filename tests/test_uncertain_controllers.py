@@ -380,8 +380,11 @@ def test_each_service_has_the_margin_that_delivers_it(seed: int, monkeypatch: py
         return SimpleNamespace(episode_levels=levels(margin) + noise, accounts=accounts, bookings=accounts[:, :, None])
 
     monkeypatch.setattr(calibration, "rollout", played)
-    made: dict[str, Any] = {"env": lambda copies: MultiAgentVectorEnv(stockist(5), num_envs=copies)}
-    result = calibrate(**made, controller=lambda margin: margin, demand=np.full(count, 0.99), draws=10)
+    one = stockist(5)
+    further = (replace(one.services[0], id=f"served_{i}") for i in range(1, count))
+    network = replace(one, services=(*one.services, *further))
+    made: dict[str, Any] = {"env": lambda copies: MultiAgentVectorEnv(network, num_envs=copies)}
+    result = calibrate(**made, controller=lambda margin: margin, demand=0.99, draws=10)
     excess = levels(result.margin) - 0.99
     assert result.excess == pytest.approx(excess.min()) and len(tried) <= calibration.TRIES
     assert (np.abs(excess[~is_anyway]) <= calibration.CLOSE / 2).all()

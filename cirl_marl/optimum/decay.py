@@ -8,10 +8,6 @@ with i::
 
 with ω_i the mean of e^{−ks} and η_i that of (1 − e^{−ks})/k, weighted with B_i. Controls are constant within a piece,
 so (w − w̲)·x and (w̄ − w)·x obey the same, with the scheduled outflow times the range of w.
-
-Of how much is left of what enters, these tell most if it enters at the start or the end of a piece. Where pieces are
-merged, other sums of moments tell as much of what enters halfway (``contact_weights``). Without them seed 110 of the
-cycles with lifetimes of ``benchmarks.yearly`` is bounded 2.3 % higher at degree 1, 0.5 % at degree 2.
 """
 
 from __future__ import annotations
@@ -24,7 +20,6 @@ from scipy import sparse, special
 from cirl_marl.network import Floats, Integers
 from cirl_marl.optimum.admissible import IntervalRanges
 from cirl_marl.optimum.matrices import ProgramRows
-from cirl_marl.optimum.quasi_steady import FAST
 
 
 def decay_rows(ranges: IntervalRanges, rows: ProgramRows) -> None:
@@ -38,8 +33,6 @@ def decay_rows(ranges: IntervalRanges, rows: ProgramRows) -> None:
         return
     chains = _DecayChains(ranges, rows)
     chains.write_stocks(nodes)
-    if layout.coarse:
-        chains.write_contacts(nodes[ranges.exits[1, nodes] * layout.length < FAST])
     position = np.full(len(network.nodes), -1)
     position[layout.valves] = np.arange(len(layout.valves))
     through = np.intersect1d(layout.valves, nodes)
@@ -69,9 +62,8 @@ class _DecayChains:
     def __init__(self, ranges: IntervalRanges, rows: ProgramRows) -> None:
         layout = rows.layout
         rate, d = ranges.exits[1], layout.degree
-        i, self.turnovers = np.arange(d + 1), rate * layout.length
-        turnover = self.turnovers[:, None]
-        self.means = np.concatenate([_decay_means(self.turnovers, d), np.exp(-turnover)], axis=1)
+        i, turnover = np.arange(d + 1), (rate * layout.length)[:, None]
+        self.means = np.concatenate([special.hyp1f1(i + 1, d + 2, -turnover), np.exp(-turnover)], axis=1)
         # where this cancels, the mean of s − ks²/2; what follows is below round-off
         first, second = np.append((i + 1) / (d + 2), 1.0), np.append((i + 1) * (i + 2) / ((d + 2) * (d + 3)), 1.0)
         slow = (first - turnover * second / 2) * layout.length
@@ -100,20 +92,6 @@ class _DecayChains:
         rows.put(end, layout.stock[moment + d] + nodes, ratio)
         rows.put(end, layout.end[piece] + nodes, -1.0)
         self._put_schedules(end, self.net_outflow[nodes], ratio * delays[:, d] - delays[:, d + 1])
-
-    def write_contacts(self, nodes: Integers) -> None:
-        """Write the sums of moments that tell most of what enters halfway through a piece."""
-        layout, rows, d = self.layout, self.rows, self.layout.degree
-        piece, moment = np.arange(layout.pieces)[:, None], self.first[:, None]
-        for i in range(d):
-            weights, start, end = contact_weights(self.turnovers[nodes], d, i)
-            row = rows.add(1, nodes, piece, -2, i)
-            for j in range(d + 1):
-                rows.put(row, layout.stock[moment + j] + nodes, weights[:, j])
-            rows.put(row, layout.end[piece] + nodes, -end)
-            rows.at_start(row, piece, nodes, start)
-            delay = (weights * self.delays[nodes, :-1]).sum(axis=1) - end * self.delays[nodes, -1]
-            self._put_schedules(row, self.net_outflow[nodes], delay)
 
     def write_factors(
         self, nodes: Integers, quantity: Integers, column: Integers, driver: Integers, factor: Floats, scale: Any
@@ -164,42 +142,3 @@ class _DecayChains:
         self.rows.put(row[:, place], self.layout.flow[moment[:, None]] + arcs, values)
         if self.layout.coarse:
             self.rows.loosen(row[:, place], arcs, np.abs(values))
-
-
-def contact_weights(turnovers: Floats, degree: int, i: int) -> tuple[Floats, Floats, Floats]:
-    """Return c, a and b of Σ c_j X_j + a x_start ≤ b x_end, for stocks of which at most so much leaves in a piece.
-
-    With r = (d + 1) Σ c_j B_j, on a piece of length 1, G(t) = ∫_t^1 r e^{−ks} ds and y = e^{ks} x, which never falls::
-
-        Σ c_j X_j = ∫ r x ds = G(0) y(0) + ∫ G dy ≤ G(0) y(0) + max G·(y(1) − y(0))
-
-    Here e^{kt} (max G − G(t)) is how far e^{kt} is from a polynomial that touches it i times at 0, twice at
-    τ = (i + 1)/(d + 1) and d − 1 − i times at 1, so that no row says more of what enters at τ.
-    """
-    tau, rest, at_start, at_end = (i + 1) / (degree + 1), (degree - i) / (degree + 1), i > 0, i < degree - 1
-    on_first = _on_first_part(tau, degree)
-    before = tau * _decay_means(tau * turnovers, degree) @ on_first
-    after = rest * _decay_means(rest * turnovers, degree) @ _on_first_part(rest, degree)[::-1, ::-1]  # times e^{kτ}
-    # r is 0 at τ, and G there is what it is at 0 and at 1, if these are touched; there r has so many zeros less one
-    conditions = [np.broadcast_to(on_first[-1], before.shape), *[before] * at_start, *[after] * at_end]
-    free = slice(max(i - 1, 0), degree + 1 - max(degree - 2 - i, 0))
-    weights = np.zeros_like(before)
-    weights[:, free] = np.linalg.svd(np.stack(conditions, axis=1)[:, :, free])[2][:, -1]
-    # G is greatest at τ if r is negative right before it
-    weights *= np.sign(weights[:, [free.start]]) * (1.0 if at_start else -1.0)
-    start = -(weights * before).sum(axis=1) * (not at_start)
-    end = np.exp(rest * turnovers) * (weights * after).sum(axis=1) * (not at_end)
-    return weights, start, end
-
-
-def _decay_means(turnovers: Floats, degree: int) -> Floats:
-    """Return ω_0 … ω_d, the means of e^{−ks} under B_0 … B_d, of each turnover kδ."""
-    means: Floats = special.hyp1f1(np.arange(degree + 1) + 1, degree + 2, -turnovers[:, None])
-    return means
-
-
-def _on_first_part(tau: float, degree: int) -> Floats:
-    """Return what B_0 … B_d are on [0, τ], as sums of the same polynomials there, shape (their sums, d + 1)."""
-    j = np.arange(degree + 1)
-    parts: Floats = special.binom(j[:, None], j) * tau**j * (1.0 - tau) ** np.maximum(j[:, None] - j, 0)
-    return parts
