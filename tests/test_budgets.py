@@ -181,25 +181,10 @@ def test_a_budget_of_nothing_has_a_price() -> None:
     assert simulate_plan(improve_plan(found)).accounts[0, 0] <= 1e-6
 
 
-def test_what_is_left_of_the_last_plan_is_tried_first() -> None:
-    """In each interval that both plan; in those that come after it goes on as it ends."""
-    tried: list[Any] = []
-    control = MPC(min_service=0.5)
-    kept: Any = SimpleNamespace()
-    control._climbs = False
-
-    def better_of(plan: object, actions: list[NDArray[np.float64]]) -> Any:
-        tried.extend(actions)
-        return kept
-
-    planner: Any = SimpleNamespace(better_of=better_of, futures=[None, None], is_short=lambda plan: plan is not kept)
-    plan, last = (
-        SimpleNamespace(task=SimpleNamespace(intervals=range(first, first + 3)), actions=np.arange(3.0)[:, None])
-        for first in (2, 1)
-    )
-    arguments: Any = planner, plan, last
-    assert control._climb(*arguments) is kept
-    assert [actions.ravel().tolist() for actions in tried] == [[1.0, 2.0, 2.0]] * 2
+def test_a_plan_goes_on_as_it_ends() -> None:
+    """In each interval that it has it does what was planned; in those that come after it, what is done last."""
+    plan: Any = SimpleNamespace(task=SimpleNamespace(intervals=range(1, 4)), actions=np.arange(3.0)[:, None])
+    assert WindowPlan.actions_of(plan, range(2, 5)).ravel().tolist() == [1.0, 2.0, 2.0]
 
 
 @pytest.mark.slow

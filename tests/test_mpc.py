@@ -131,6 +131,34 @@ def test_what_serves_less_takes_no_place_however_cheap() -> None:
     assert planner.better_of(priced, idle).value > free.value
 
 
+@pytest.mark.parametrize("replan", [1, 4])
+@pytest.mark.parametrize(
+    ("stock", "sales", "demand"), [(20.0, 16.0, 0.9), (25.0, 16.0, 0.9), (10.0, 12.0, 1.0), (20.0, 12.0, 0.9)]
+)
+def test_keeps_a_stock_that_programs_would_hold_back(replan: int, stock: float, sales: float, demand: float) -> None:
+    """A shop sells what it may, at most what it holds: u_t = x_t − x_{t−1} + min(S, x_{t−1}) is ordered, λ̄ = −Σ u/T.
+
+    Programs let it sell less and order less. What the service may lack is best left out in the last year, and plans
+    that are made anew ask for no more.
+    """
+    supply = Control(kind=ControlKind.FLOW, low=0.0, neutral=0.0, high=30.0)
+    network = Network(
+        name="shop",
+        nodes=(RESERVE, Node(id="shop", initial=(stock, stock)), replace(TIP, role=Role.TECHNOSPHERE)),
+        arcs=(
+            Arc(id="order", donor="reserve", recipient="shop", law=Law.CONTROLLED, control=supply),
+            Arc(id="sales", donor="shop", recipient="tip", law=Law.EXOGENOUS, flow=sales),
+        ),
+        services=(Service(id="held", provider="shop", quantity="stock", low=15.0),),
+        episode=Episode(control_interval=1.0, horizon=5),
+    )
+    run = rollout(MultiAgentVectorEnv(network, num_envs=1), MPC(min_service=demand, replan=replan))
+    held = np.array([stock, 15.0, 15.0, 15.0, 15.0, 15.0 * (1.0 - 5.0 * (1.0 - demand))])
+    orders = np.diff(held) + np.minimum(sales, held[:-1])
+    assert run.episode_levels.min() == pytest.approx(demand, abs=2e-4)
+    assert run.episode_circularity[0] == pytest.approx(-orders.sum() / 5, rel=1e-3)
+
+
 def test_a_service_out_of_reach_is_approached() -> None:
     """From a stock of 2 a level of 1 throughout cannot be had: all is mined until the stock is there, then kept."""
     run = rollout(

@@ -239,10 +239,9 @@ def test_a_changed_notebook_is_noticed(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("script", SCRIPTS, ids=[path.stem for path in SCRIPTS])
 def test_notebooks_run(script: Path) -> None:
-    """Each runs to its end in under three minutes of one core, and prints and draws what is kept, but for figures."""
+    """Each runs to its end, and prints and draws what is kept, but for figures."""
     pytest.importorskip("nbclient", reason="needs the extra 'docs'")
     found = notebooks.executed(script)
-    assert found.seconds < LIMIT_S
     _, _, _, _, rest = notebooks.kept(script).read_text(encoding="utf-8").split("\n", 4)
     before = rest.strip().splitlines()
     now = found.text.split("\n", 1)[1].strip().splitlines()

@@ -466,28 +466,25 @@ class MPC(Planner):
         task = self._task(planner, self._stock(copy), intervals, demands, last, later, is_outlook=is_outlook)
         rounds = 1 if self._follows else MOST_ROUNDS  # what contents come to no correction of the program foresees
         plan = planner.plan(task, last.basis(intervals) if last else None, self._replan, rounds)
-        has_budgets = self._drawn is None and bool(self._aims.budgets)
-        if has_budgets and demands.deficit is not None:  # idle supplies are planned in full, and may be short
+        is_certain = self._drawn is None
+        if is_certain and demands.deficit is not None and self._full.any():  # they may be short
             demand = np.clip(demands.deficit / len(intervals), 0.0, 1.0)
             plan = planner.at_price(replace(plan, task=replace(plan.task, demand=demand)), plan.task.price)
-        if (self._climbs or has_budgets) and not is_outlook and not self._follows:
-            plan = self._climb(planner, plan, last)
+        if not self._follows:
+            if last is not None and (self._climbs or is_certain):
+                plan = planner.better_of(plan, [last.actions_of(intervals)] * len(planner.futures))
+            if self._climbs or (is_certain and planner.is_short(plan)):
+                plan = self._climb(planner, plan)
         if is_outlook or self._drawn is not None:
             return plan
         return planner.better_of(plan, [np.tile(self._neutral_entries(copy), (len(intervals), 1))])
 
-    def _climb(self, planner: WindowPlanner, plan: WindowPlan, last: WindowPlan | None) -> WindowPlan:
-        """Return a plan in which contents count as they come about, from a plan or what is left of the one before.
+    def _climb(self, planner: WindowPlanner, plan: WindowPlan) -> WindowPlan:
+        """Return a plan improved in the simulator, where contents come about and demands are kept.
 
         In each of several futures other actions may be best. Of what is best at first in one of them, and the mean of
         these, that is done which does best in all.
         """
-        if last is not None:
-            ahead = plan.task.intervals.start - last.task.intervals.start
-            places = np.minimum(np.arange(ahead, ahead + len(plan.actions)), len(last.actions) - 1)
-            plan = planner.better_of(plan, [last.actions[places]] * len(planner.futures))
-            if not self._climbs and not planner.is_short(plan):
-                return plan
         climbs = [climb_window(future, plan.task, plan.actions, self._weight) for future in planner.futures]
         courses, prices = zip(*climbs, strict=True)
         if plan.task.has_to_serve:

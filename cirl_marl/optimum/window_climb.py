@@ -91,6 +91,6 @@ def climb_window(
     budgets = len(task.limits)
     services = np.zeros(len(demand)) if task.demand is None else task.price[budgets:]
     price = np.concatenate([services, task.price[:budgets] / (share * future.aims.sizes[:budgets])])
-    better, price = climb(plan, trials, price, ROUNDS)
+    better, price = climb(plan, trials, price, ROUNDS, demand_first=task.has_to_serve)
     budget_price = price[len(demand) :] * share * future.aims.sizes[:budgets]
     return better.actions, np.append(budget_price, price[: len(task.price) - budgets])

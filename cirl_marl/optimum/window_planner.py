@@ -546,10 +546,11 @@ class WindowPlanner:
     def with_actions(self, plan: WindowPlan, actions: Sequence[Floats]) -> WindowPlan:
         """Return a plan with other actions, and what comes of them; see ``better_of``."""
         outcomes = [future.carry_out(plan.task, course) for future, course in zip(self.futures, actions, strict=True)]
-        level = np.mean([np.minimum(outcome.level, 1.0).mean(axis=0) for outcome in outcomes], axis=0)
+        levels = np.mean([np.minimum(outcome.level, 1.0) for outcome in outcomes], axis=0)
         bookings = np.mean([outcome.bookings for outcome in outcomes], axis=0)
         value = float(np.mean([outcome.value for outcome in outcomes]))
-        other = replace(plan, actions=actions[0], level=level, bookings=bookings, value=value)
+        reached = {"levels": levels, "level": levels.mean(axis=0), "bookings": bookings, "value": value}
+        other = replace(plan, actions=actions[0], **reached)
         return replace(other, merit=self._merit(other, plan.task.price))
 
     def is_short(self, plan: WindowPlan) -> bool:

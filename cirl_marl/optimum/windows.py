@@ -91,7 +91,9 @@ class WindowPlan:
     solution: Annotated[Solution, "its optimum"]
     actions: Annotated[Floats, "normalised, in the first of the futures, shape (intervals, entries)"]
     corrections: Annotated[tuple[Correction, ...], "what became of it in each future"]
-    levels: Annotated[Floats, "that the program promises on average, shape (intervals, services)"]
+    levels: Annotated[
+        Floats, "that the program promises, or actions found otherwise reach, on average, shape (intervals, services)"
+    ]
     level: Annotated[Floats, "mean of each service that was reached, shape (services,)"]
     bookings: Annotated[Floats, "on budgeted accounts, on average, in parts of budgets, shape (intervals, budgets)"]
     value: Annotated[float, "objective reached there, less what is left to later intervals"]
@@ -111,6 +113,11 @@ class WindowPlan:
         if len(self.corrections) > 1 or intervals.stop != own.stop or intervals.start < own.start:
             return None
         return basis.without_first(self.problem, intervals.start - own.start)
+
+    def actions_of(self, intervals: range) -> Floats:
+        """Return the actions in other ``intervals``, in later ones the last, shape (intervals, entries)."""
+        ahead = np.arange(intervals.start, intervals.stop) - self.task.intervals.start
+        return np.asarray(self.actions[np.minimum(ahead, len(self.actions) - 1)])
 
     def corrections_of(self, intervals: range, futures: int) -> tuple[Correction, ...]:
         """Return what is expected of other ``intervals``: what became of these, the last of them from there on.
