@@ -104,7 +104,10 @@ def certain_process(network: Network) -> Network:
 
 @pytest.mark.slow
 def test_without_noise_all_plans_are_one(make_network: Callable[..., Network]) -> None:
-    """Where a process never changes, MPC, with conditional means or with futures, is that of the network without."""
+    """Where a process never changes, MPC, with conditional means or futures, is nearly that of the network without.
+
+    What is certain goes on as it planned where that does better.
+    """
     compared = 0
     for seed in range(9):
         network = certifiable(make_network(seed, 5, 8), 0.5, False).with_options(episode={"horizon": 3})
@@ -124,7 +127,9 @@ def test_without_noise_all_plans_are_one(make_network: Callable[..., Network]) -
         compared += 1
         scale = network.objective.circularity_scale
         merit = [run.episode_circularity / scale + 1000.0 * run.episode_service for run in runs]
-        np.testing.assert_allclose(merit[1:3], np.tile(merit[0], (2, 1)), rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(merit[2], merit[1], rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(merit[1], merit[0], rtol=1e-3)
+        assert (merit[0] >= merit[1] - 1e-7 * np.abs(merit[1])).all()
         np.testing.assert_allclose(merit[3], merit[0], rtol=0.01)  # another vertex of the same optimum
     assert compared >= 4
 
