@@ -155,9 +155,9 @@ def test_steps_that_promise_little_are_not_made(monkeypatch: pytest.MonkeyPatch)
     """But while a service is short any gain is worth a step."""
     solved = list[None]()
 
-    def counted(*arguments: Any) -> Any:
+    def counted(*arguments: Any, is_wide: bool) -> Any:
         solved.append(None)
-        return jacobians(*arguments)
+        return jacobians(*arguments, is_wide=is_wide)
 
     monkeypatch.setattr(improve, "jacobians", counted)
     found, counts = bound(SHORT, min_service=0.95, degree=1), list[int]()

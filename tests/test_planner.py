@@ -189,6 +189,27 @@ def test_plans_keep_services_whose_price_the_bound_underrates(stock: float, sale
     assert simulate_plan(improve_plan(found)).episode_levels.min() >= demand - 1e-4
 
 
+def test_wide_slopes_see_orders_of_more_than_is_sold_at_once() -> None:
+    """An empty shop holds little of a little more, as it sells what comes; of all of a range much is left."""
+    supply = Control(kind=ControlKind.FLOW, low=0.0, neutral=0.0, high=60.0)
+    network = small(
+        {"mine": 500.0, "van": 0.0, "shop": 0.0, "tip": 0.0},
+        [
+            Arc(id="order", donor="mine", recipient="van", law=Law.CONTROLLED, control=supply),
+            Arc(id="delivery", donor="van", recipient="shop", rate=12.0),
+            Arc(id="sales", donor="shop", recipient="tip", law=Law.EXOGENOUS, flow=24.0),
+        ],
+        horizon=3,
+    )
+    plan = replace(bound(network), actions=np.full((3, 1), -0.9))
+    shop, dynamics = network.node_index["shop"], Dynamics(network)
+    near, wide = (jacobians(plan, dynamics, is_wide=is_wide).by_action for is_wide in (False, True))
+    before, full = simulate_plan(plan), simulate_plan(replace(plan, actions=np.ones((3, 1))))
+    change = np.concatenate([full.stock[0], full.flow[0]]) - np.concatenate([before.stock[0], before.flow[0]])
+    np.testing.assert_allclose(wide[0, :, 0], change / 1.9, rtol=1e-9, atol=1e-9)
+    assert wide[0, shop, 0] > 3.0 * near[0, shop, 0] > 0.0
+
+
 def test_the_best_of_a_round_counts_and_what_it_lacks_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """Corrections start from the first program, end with one that is worse or keeps services; demands end at 1."""
     found = bound("copper_net", min_service=0.995, horizon=3, degree=1)
@@ -223,7 +244,7 @@ def test_the_best_of_a_round_counts_and_what_it_lacks_is_asked_for(monkeypatch: 
     steps = (np.full(found.actions.size, step) for step in 0.001 * 2.0 ** np.arange(5))
     monkeypatch.setattr(improve, "simulate_plan", episode)
     slopes = SimpleNamespace(supplies=SimpleNamespace(services=()))
-    monkeypatch.setattr(improve, "jacobians", lambda plan, dynamics, first: slopes)
+    monkeypatch.setattr(improve, "jacobians", lambda *plan, is_wide: slopes)
     monkeypatch.setattr(improve, "step_program", program)
     monkeypatch.setattr(improve, "best_values", lambda problem, scale: next(steps))
     monkeypatch.setattr(improve, "penalised_objective", lambda bound, run, prices: run.worth)

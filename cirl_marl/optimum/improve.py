@@ -51,14 +51,15 @@ CONTENT_STARTS, SMALL_STARTS, SMALL = 4, 16, 5000
 ones are ends and middles of ranges: of 24 such 8 lead to the optimum of Haverly's second pooling problem, of as many
 uniform ones 3; three miss it where sources have 800 t in place of 600."""
 LEAP = 2.0
-"""Half-width of the trust region, all of the range, of a step to what is not made any more, as it is too impure."""
+"""Half-width of the trust region, all of the range, where small steps serve no more: of a step to what is not made any
+more, as it is too impure, or to stocks that schedules empty, by wide slopes."""
 DEARER = 10.0
 """By what prices of what is short rise where no step helps: beside contents, budgets and flows that the simulator cuts
 only from empty donors the bound knows low ones."""
 STALL = 0.05
 """Part of what is charged for what is short, which a step has to gain if prices are to stay there."""
 EXTENSION = 3
-"""Times the usual rounds, of which there may be as many beside contents and budgets while something is short."""
+"""Times the usual rounds, of which there may be as many where prices may rise, while something is short."""
 NO_PROMISE = 1e-10
 """Part of the objective that a step has to promise, to be tried: one within a smaller region promises even less."""
 TOLERATED_SHORTFALL = 1e-4
@@ -175,23 +176,23 @@ def climb(
     best, run = plan, trials.simulate(plan)
     value, trust, slopes = trials.value(run, price), TRUST, None
     has_contents, is_leap = any(service.substance for service in plan.network.services), False
-    is_cheap = has_contents or bool(aims.budgets)
-    may_rise = is_cheap or demand_first
+    may_rise = has_contents or bool(aims.budgets) or demand_first
     nearest, nearest_shortfall = plan, _total_shortage(demand, aims, run)
     shortfall = nearest_shortfall
-    for done in range(EXTENSION * rounds if is_cheap else rounds):
+    for done in range(EXTENSION * rounds if may_rise else rounds):
         is_short = np.append(demand - run.episode_levels[0], aims.excess(run) / aims.sizes) > TOLERATED_SHORTFALL
         if done >= rounds and not is_short.any():
             break
         if trust < SMALLEST and may_rise and is_short.any():
-            is_leap = has_contents and not is_leap
-            trust = LEAP
+            is_leap, trust = not is_leap, LEAP
+            slopes = slopes if has_contents else None
             if not is_leap:
                 price[is_short] *= DEARER
                 value, trust = trials.value(run, price), TRUST
         if trust < SMALLEST or enough(run):
             break
-        slopes = jacobians(best, dynamics, trials.span.first) if slopes is None else slopes
+        if slopes is None:
+            slopes = jacobians(best, dynamics, trials.span.first, is_wide=is_leap and not has_contents)
         wanted, limits = np.minimum(demand + lack, 1.0), aims.limits - excess
         steps = list[_Step | None]()
         for is_held in (False, True) if len(slopes.supplies.services) else (False,):
@@ -209,7 +210,7 @@ def climb(
             if shortfall <= nearest_shortfall:  # at other prices less may be kept later
                 nearest, nearest_shortfall = best, shortfall
             value, slopes = value + step.gain, None
-            is_stalled = is_cheap and step.gain < STALL * float(price @ np.append(lack, excess))
+            is_stalled = may_rise and step.gain < STALL * float(price @ np.append(lack, excess))
             trust = 0.0 if is_stalled else min(1.0, 2 * trust)
             is_leap = is_leap and is_stalled
         else:

@@ -75,8 +75,12 @@ class Slopes:
             stock = response[:nodes]
 
 
-def jacobians(plan: ActionPlan, dynamics: Dynamics, first: int = 0) -> Slopes:
-    """Return the slopes of every interval from the first, around a plan."""
+def jacobians(plan: ActionPlan, dynamics: Dynamics, first: int = 0, *, is_wide: bool = False) -> Slopes:
+    """Return the slopes of every interval from the first, around a plan.
+
+    If ``is_wide``, those by actions are quotients over all of a range, each to its farther end: of a little more that
+    comes to an empty stock a schedule takes nearly all.
+    """
     steps = len(plan.actions)
     stock = WindowSimulator(dynamics, plan.agents).run(plan.initial, plan.actions, first)[0]
     actuators, interval = Actuators(plan.network, plan.agents or None, steps), np.arange(first, first + steps)
@@ -86,13 +90,12 @@ def jacobians(plan: ActionPlan, dynamics: Dynamics, first: int = 0) -> Slopes:
     supplies = IdleSupplies.of(dynamics, supply, idle & is_held, masses, controls, first)
     follows = idle & (not is_held)
     if not has_interval_maps(dynamics):
-        return _quotients(plan, dynamics, stock, supplies, follows, interval)
+        return _quotients(plan, dynamics, stock, supplies, follows, interval, is_wide=is_wide)
     controls = supply(masses, inner, controls, interval, follows)
     by_stock, by_schedule = IntervalMaps(dynamics).responses(masses, dynamics.rate(controls, interval))
     idle_rows = supply.rows[follows.ravel()]
-    slopes = _quotients(
-        plan, dynamics, stock, supplies, np.zeros_like(follows), interval, (idle_rows, controls[idle_rows])
-    )
+    held = idle_rows, controls[idle_rows]
+    slopes = _quotients(plan, dynamics, stock, supplies, np.zeros_like(follows), interval, held, is_wide=is_wide)
     following_supplies = FollowingSupplies(supply, follows, interval, controls, by_schedule)
     return replace(
         slopes, by_stock=following_supplies.after(by_stock), by_action=following_supplies.after(slopes.by_action)
@@ -107,6 +110,8 @@ def _quotients(
     follows: Bools,
     interval: Integers,
     fixed_controls: tuple[Integers, Floats] | None = None,
+    *,
+    is_wide: bool,
 ) -> Slopes:
     """Return the slopes as difference quotients; by actions alone where rows and values of some controls are given."""
     network, nodes, (steps, entries) = plan.network, dynamics.rows.nodes.stop, plan.actions.shape
@@ -118,6 +123,8 @@ def _quotients(
     # forward in stocks, which may be 0; inward in actions, which may be at a bound, and in what is brought
     # one batch simulates all difference quotients of all intervals: column (t, j) has input j of interval t shifted
     shift = np.where(np.arange(nodes + entries) < nodes, 1.0, -np.where(inputs >= 0, 1.0, -1.0)) * width
+    if is_wide:
+        shift[:, nodes:] = -np.where(plan.actions >= 0, 1.0, -1.0) - plan.actions
     shift = shift[:, shifted_rows]
     inward = np.where(supplies.high > -supplies.low, 1.0, -1.0) * DIFFERENCE * np.maximum(supplies.size, TINY)
     columns = np.repeat(inputs[:, :, None], count + 1, axis=2)
