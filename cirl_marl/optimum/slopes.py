@@ -94,8 +94,10 @@ def jacobians(plan: ActionPlan, dynamics: Dynamics, first: int = 0, *, is_wide: 
     controls = supply(masses, inner, controls, interval, follows)
     by_stock, by_schedule = IntervalMaps(dynamics).responses(masses, dynamics.rate(controls, interval))
     idle_rows = supply.rows[follows.ravel()]
-    held = idle_rows, controls[idle_rows]
-    slopes = _quotients(plan, dynamics, stock, supplies, np.zeros_like(follows), interval, held, is_wide=is_wide)
+    idle_controls = idle_rows, controls[idle_rows]
+    slopes = _quotients(
+        plan, dynamics, stock, supplies, np.zeros_like(follows), interval, idle_controls, is_wide=is_wide
+    )
     following_supplies = FollowingSupplies(supply, follows, interval, controls, by_schedule)
     return replace(
         slopes, by_stock=following_supplies.after(by_stock), by_action=following_supplies.after(slopes.by_action)

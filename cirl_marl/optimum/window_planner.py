@@ -549,8 +549,8 @@ class WindowPlanner:
         levels = np.mean([np.minimum(outcome.level, 1.0) for outcome in outcomes], axis=0)
         bookings = np.mean([outcome.bookings for outcome in outcomes], axis=0)
         value = float(np.mean([outcome.value for outcome in outcomes]))
-        reached = {"levels": levels, "level": levels.mean(axis=0), "bookings": bookings, "value": value}
-        other = replace(plan, actions=actions[0], **reached)
+        figures = {"levels": levels, "level": levels.mean(axis=0), "bookings": bookings, "value": value}
+        other = replace(plan, actions=actions[0], **figures)
         return replace(other, merit=self._merit(other, plan.task.price))
 
     def is_short(self, plan: WindowPlan) -> bool:
