@@ -210,6 +210,31 @@ def test_wide_slopes_see_orders_of_more_than_is_sold_at_once() -> None:
     assert wide[0, shop, 0] > 3.0 * near[0, shop, 0] > 0.0
 
 
+def test_a_step_over_whole_ranges_is_tried_before_prices_rise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a shop that is asked to hold more than its orders allow, where small steps serve no more."""
+    supply = Control(kind=ControlKind.FLOW, low=0.0, neutral=0.0, high=2.0)
+    network = small(
+        {"mine": 100.0, "shop": 30.0, "tip": 0.0},
+        [
+            Arc(id="order", donor="mine", recipient="shop", law=Law.CONTROLLED, control=supply),
+            Arc(id="sales", donor="shop", recipient="tip", law=Law.EXOGENOUS, flow=12.0),
+        ],
+    )
+    mine, *others = network.nodes
+    service = Service(id="held", provider="shop", quantity="stock", low=15.0)
+    nodes = (replace(mine, role=Role.NONRENEWABLE_RESERVOIR), *others)
+    found, wide = bound(replace(network, nodes=nodes, services=(service,)), min_service=0.4), list[bool]()
+    found = replace(found, min_service=np.array([0.9]))
+
+    def counted(*arguments: Any, is_wide: bool) -> Any:
+        wide.append(is_wide)
+        return jacobians(*arguments, is_wide=is_wide)
+
+    monkeypatch.setattr(improve, "jacobians", counted)
+    assert simulate_plan(improve_plan(found)).episode_levels.max() < 0.5
+    assert not wide[0] and any(wide) and not wide[wide.index(True) + 1]
+
+
 def test_the_best_of_a_round_counts_and_what_it_lacks_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """Corrections start from the first program, end with one that is worse or keeps services; demands end at 1."""
     found = bound("copper_net", min_service=0.995, horizon=3, degree=1)
