@@ -272,7 +272,7 @@ def test_the_best_of_a_round_counts_and_what_it_lacks_is_asked_for(monkeypatch: 
     monkeypatch.setattr(improve, "jacobians", lambda *plan, is_wide: slopes)
     monkeypatch.setattr(improve, "step_program", program)
     monkeypatch.setattr(improve, "best_values", lambda problem, scale: next(steps))
-    monkeypatch.setattr(improve, "penalised_objective", lambda bound, run, prices: run.worth)
+    monkeypatch.setattr(improve.Trials, "value", lambda trials, run, price: run.worth)
     better = improve_plan(found, rounds=2)
     np.testing.assert_allclose(better.actions, np.clip(np.clip(found.actions + 0.002, -1, 1) + 0.016, -1, 1))
     assert demands == [pytest.approx(0.995), 1.0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from types import SimpleNamespace
 from typing import Any
 
@@ -252,42 +253,52 @@ def test_what_an_agent_supplies_is_no_part_of_what_idle_arcs_bring() -> None:
 
 
 def test_the_plan_that_is_least_short_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where a later one is worth more at its price, and exceeds the budget by more; prices rise, for more rounds."""
+    """Where a later one is worth more at its price, and exceeds the budget by more; prices rise, and fall back."""
 
     @dataclass
     class Planned:
         actions: Floats
         network: Network
-        aims: Any
 
     steps = iter([np.array([0.1]), None, np.array([0.2]), None])
-    excess = {0.0: 0.5, 0.1: 0.1, 0.3: 0.3}  # of the budget, by action; the last one is worth 2 more
+    booked = {0.0: 0.5, 0.1: 0.1, 0.3: 0.3}  # by action; the last one is worth 2 more
+
+    def limited(limit: float) -> Any:
+        return SimpleNamespace(
+            budgets=("budget",),
+            limits=np.array([limit]),
+            sizes=np.ones(1),
+            excess=lambda run: np.maximum(run.booked - limit, 0.0),
+            with_lower_budgets=lambda excess: limited(limit - excess[0]),
+        )
 
     def episode(plan: Planned) -> SimpleNamespace:
         action = round(float(plan.actions[0, 0]), 6)
-        over, worth = np.array([excess[action]]), 20 * (action > 0.1)
-        return SimpleNamespace(episode_levels=np.zeros((1, 0)), excess=over, worth=worth)
+        return SimpleNamespace(
+            episode_levels=np.zeros((1, 0)), booked=np.array([booked[action]]), worth=20 * (action > 0.1)
+        )
 
     columns = SimpleNamespace(action=np.array([[0]]))
     step = SimpleNamespace(problem=None, scale=None, columns=columns, promise=lambda values: 1.0)
     step.with_correction = lambda *about: step
     slopes = SimpleNamespace(supplies=SimpleNamespace(services=()))
-    monkeypatch.setattr(improve, "jacobians", lambda *about: slopes)
-    solved = list[object]()
+    monkeypatch.setattr(improve, "jacobians", lambda *about, is_wide: slopes)
+    charged = list[float]()
 
-    def program(*about: object, **options: object) -> SimpleNamespace:
-        solved.append(about)
+    def program(
+        plan: Planned, dynamics: object, run: object, demand: Floats, price: Floats, *rest: object, **options: Any
+    ) -> Any:
+        charged.append(float(price[0]))
         return step
 
     monkeypatch.setattr(improve, "step_program", program)
     monkeypatch.setattr(improve, "best_values", lambda *about: next(steps, None))
-    aims = SimpleNamespace(budgets=("budget",), limits=np.ones(1), sizes=np.ones(1), excess=lambda run: run.excess)
-    trials = improve.Trials(episode, lambda run, price: run.worth - float(price @ run.excess), np.zeros(0))
-    plan: Any = Planned(np.zeros((1, 1)), harbour(), aims)
-    best, price = improve.climb(plan, trials, np.ones(1), rounds=4)
+    trials = improve.Trials(episode, attrgetter("worth"), np.zeros(0), limited(0.0))
+    plan: Any = Planned(np.zeros((1, 1)), harbour())
+    best, price = improve.climb(plan, trials, np.ones(1), rounds=20)
     assert best.actions == pytest.approx(0.1)
-    assert len(solved) == 4 * improve.EXTENSION
-    assert price[0] > 1
+    assert max(charged) == improve.DEARER**improve.VAIN_RISES
+    assert price[0] == charged[-1] == 1.0  # what it takes to keep what was kept
 
 
 def test_a_step_lets_supplies_fall_and_no_further_than_to_nothing() -> None:

@@ -56,6 +56,8 @@ more, as it is too impure, or to stocks that schedules empty, by wide slopes."""
 DEARER = 10.0
 """By what prices of what is short rise where no step helps: beside contents, budgets and flows that the simulator cuts
 only from empty donors the bound knows low ones."""
+VAIN_RISES = 3
+"""How often prices rise in vain, before what is out of reach is asked for as far as it was had."""
 STALL = 0.05
 """Part of what is charged for what is short, which a step has to gain if prices are to stay there."""
 EXTENSION = 3
@@ -97,7 +99,7 @@ def improve_plan(
     if slopes > MOST_SLOPES:
         return refine(bound, enough=enough, progress=progress)
     starts = start_count(network, slopes) if starts is None else starts
-    trials = Trials(simulate_plan, lambda run, price: penalised_objective(bound, run, price), demand(bound))
+    trials = _trials(bound)
     plans: list[Bound] = []
     for start, actions in enumerate(starting_actions(bound.actions, starts)):
         report = partial(_tell, progress, start, starts)
@@ -107,7 +109,7 @@ def improve_plan(
     if starts == 1:
         return plans[0]
     runs, price = [simulate_plan(plan) for plan in plans], prices(bound)
-    shortages = [_total_shortage(trials.demand, bound.aims, run) for run in runs]
+    shortages = [trials.total_shortage(run) for run in runs]
     ranks = [(-short, penalised_objective(bound, run, price)) for short, run in zip(shortages, runs, strict=True)]
     return plans[ranks.index(max(ranks))]
 
@@ -137,11 +139,29 @@ class Trials:
     """How plans of some intervals from the same start are tried, and what is expected of them."""
 
     simulate: Annotated[Callable[[Any], Any], "plan → its episode in the simulator"]
-    value: Annotated[
-        Callable[[Any, Floats], float], "(episode, prices) → objective reached, less the price of what lacks"
-    ]
+    objective: Annotated[Callable[[Any], float], "episode → objective reached"]
     demand: Annotated[Floats, "mean level of each service, 0 for none, shape (services,)"]
+    aims: Annotated[Aims, "with the budgets"]
     span: Annotated[Span, "these intervals"] = ALL
+
+    def value(self, run: Any, price: Floats) -> float:
+        """Return the objective that an episode reaches, less the price of what is short, see ``climb``."""
+        lacks = np.maximum(0.0, self.demand - run.episode_levels[0])
+        return self.objective(run) - float(price @ np.concatenate([lacks, self.aims.excess(run)]))
+
+    def shortages(self, run: Any) -> Floats:
+        """Return what an episode is short of each demand and, relative to it, of each budget."""
+        return np.concatenate([self.demand - run.episode_levels[0], self.aims.excess(run) / self.aims.sizes])
+
+    def total_shortage(self, run: Any) -> float:
+        """Return the sum of what is short beyond what is tolerated: as one is out of reach others may still be kept."""
+        shortages = self.shortages(run)
+        return float(shortages[shortages > TOLERATED_SHORTFALL].sum())
+
+    def attained(self, run: Any) -> Trials:
+        """Return trials that demand no more than an episode keeps."""
+        levels: Floats = np.minimum(self.demand, run.episode_levels[0])
+        return replace(self, demand=levels, aims=self.aims.with_lower_budgets(-self.aims.excess(run)))
 
 
 def climb(
@@ -155,40 +175,61 @@ def climb(
     least_gain: float = NO_PROMISE,
     demand_first: bool = False,
 ) -> tuple[P, Floats]:
-    """Return a plan with better actions, by linear programs around episodes, from its own, and the last prices.
+    """Return a plan with better actions, by linear programs around episodes, from its own, and the price it needed.
 
     Where contents are demanded or there are budgets, or with ``demand_first``, prices rise of what is short and no step
-    helps.
+    helps. What is out of reach even so is asked for as far as it was had, and the objective improved beside that.
 
     Args:
         plan: with the actions to start from.
         trials: of plans like it.
         price: what is charged for a unit that each service lacks, and by which each budget is exceeded.
-        rounds: most steps, in each of which a few programs are solved; EXTENSION times as many beside contents and
-            budgets while something is short.
+        rounds: most steps, in each of which a few programs are solved; EXTENSION times as many where prices may rise
+            while something is short.
         enough: asked of each episode that is better than those before, whether to stop there.
         progress: called with the share of rounds that are done.
         least_gain: as in ``improve_plan``.
         demand_first: whether what is demanded comes before the price that it has at first.
     """
-    dynamics, demand, aims, price = Dynamics(plan.network), trials.demand, plan.aims, price.copy()
+    may_rise = any(s.substance for s in plan.network.services) or bool(trials.aims.budgets) or demand_first
+    options = rounds, enough, progress, least_gain, may_rise
+    best, run, price = _ascend(plan, trials, price, *options)
+    if may_rise and trials.total_shortage(run) > 0 and not enough(run):
+        best, _, price = _ascend(best, trials.attained(run), price, *options)
+    progress(1.0)
+    return best, price
+
+
+def _ascend(
+    plan: P,
+    trials: Trials,
+    price: Floats,
+    rounds: int,
+    enough: Callable[[Any], bool],
+    progress: Callable[[float], None],
+    least_gain: float,
+    may_rise: bool,
+) -> tuple[P, Any, Floats]:
+    """Return the plan that is least short, its episode and the price at which it was found; see ``climb``."""
+    dynamics, demand, aims, price = Dynamics(plan.network), trials.demand, trials.aims, price.copy()
     lack, excess = np.zeros(len(demand)), np.zeros(len(aims.budgets))
     best, run = plan, trials.simulate(plan)
     value, trust, slopes = trials.value(run, price), TRUST, None
     has_contents, is_leap = any(service.substance for service in plan.network.services), False
-    may_rise = has_contents or bool(aims.budgets) or demand_first
-    nearest, nearest_shortfall = plan, _total_shortage(demand, aims, run)
-    shortfall = nearest_shortfall
+    shortfall = trials.total_shortage(run)
+    nearest, nearest_run, nearest_shortfall, needed, vain_rises = plan, run, shortfall, price.copy(), 0
     for done in range(EXTENSION * rounds if may_rise else rounds):
-        is_short = np.append(demand - run.episode_levels[0], aims.excess(run) / aims.sizes) > TOLERATED_SHORTFALL
+        is_short = trials.shortages(run) > TOLERATED_SHORTFALL
         if done >= rounds and not is_short.any():
             break
         if trust < SMALLEST and may_rise and is_short.any():
             is_leap, trust = not is_leap, LEAP
             slopes = slopes if has_contents else None
             if not is_leap:
+                if vain_rises == VAIN_RISES:
+                    break
                 price[is_short] *= DEARER
-                value, trust = trials.value(run, price), TRUST
+                value, trust, vain_rises = trials.value(run, price), TRUST, vain_rises + 1
         if trust < SMALLEST or enough(run):
             break
         if slopes is None:
@@ -206,17 +247,18 @@ def climb(
             best, run = step.plan, step.run
             lack = np.maximum(demand - run.episode_levels[0], 0.0)  # a step lacks about what the last one did
             excess = aims.excess(run)
-            shortfall = _total_shortage(demand, aims, run)
+            shortfall = trials.total_shortage(run)
+            if shortfall < nearest_shortfall - TOLERATED_SHORTFALL:
+                vain_rises = 0
             if shortfall <= nearest_shortfall:  # at other prices less may be kept later
-                nearest, nearest_shortfall = best, shortfall
+                nearest, nearest_run, nearest_shortfall, needed = best, run, shortfall, price.copy()
             value, slopes = value + step.gain, None
             is_stalled = may_rise and step.gain < STALL * float(price @ np.append(lack, excess))
             trust = 0.0 if is_stalled else min(1.0, 2 * trust)
             is_leap = is_leap and is_stalled
         else:
             trust = 0.0 if is_leap or not any(steps) else trust / 4
-    progress(1.0)
-    return (nearest if may_rise and shortfall > nearest_shortfall else best), price
+    return (nearest, nearest_run, needed) if may_rise else (best, run, price)
 
 
 @positional_record
@@ -246,7 +288,7 @@ def _corrected_step(
             best = _Step(candidate, trial, gain)
         elif best.gain > 0:
             break
-        if best.gain > 0 and _shortage(trials.demand, plan.aims, trial) <= TOLERATED_SHORTFALL:
+        if best.gain > 0 and trials.shortages(trial).max(initial=0.0) <= TOLERATED_SHORTFALL:
             break
         corrected = program.with_correction(values, run, trial)
     return best
@@ -280,40 +322,29 @@ def _scale(bound: Bound) -> float:
 
 def penalised_objective(bound: Bound, run: Rollout, prices: Floats) -> float:
     """Return the objective of the bound that an episode reaches, less the price of what is short of its demands."""
+    return _trials(bound).value(run, prices)
+
+
+def objective(bound: Bound, run: Rollout) -> float:
+    """Return the objective of the bound that an episode reaches, whatever it is short of."""
     if bound.service_weight is not None:
         scale = bound.network.objective.circularity_scale
-        value = float(run.episode_circularity[0]) / scale + bound.service_weight * float(run.episode_service[0])
-    else:
-        value = bound.aims.value(run)
-    lacks = np.maximum(0.0, demand(bound) - run.episode_levels[0])
-    return value - float(prices @ np.concatenate([lacks, bound.aims.excess(run)]))
+        return float(run.episode_circularity[0]) / scale + bound.service_weight * float(run.episode_service[0])
+    return bound.aims.value(run)
 
 
 def shortage(bound: Bound, run: Rollout) -> float:
     """Return the most that an episode is short of a demand: of a mean level, or of a budget, relative to that."""
-    return _shortage(demand(bound), bound.aims, run)
-
-
-def _shortage(demand: Floats, aims: Aims, run: Any) -> float:
-    return float(_shortages(demand, aims, run).max(initial=0.0))
-
-
-def _total_shortage(demand: Floats, aims: Aims, run: Any) -> float:
-    """Return the sum of what is short, but for what is tolerated: as one is out of reach others may still be kept."""
-    shortages = _shortages(demand, aims, run)
-    return float(shortages[shortages > TOLERATED_SHORTFALL].sum())
-
-
-def _shortages(demand: Floats, aims: Aims, run: Any) -> Floats:
-    """Return what an episode is short of each demand and, relative to it, of each budget."""
-    excess, limits = aims.excess(run), np.abs(aims.limits)
-    relative_excess = np.divide(excess, limits, out=np.where(excess > 0, np.inf, 0.0), where=limits > 0)
-    return np.concatenate([demand - run.episode_levels[0], relative_excess])
+    return float(_trials(bound).shortages(run).max(initial=0.0))
 
 
 def demand(bound: Bound) -> Floats:
     """Return the mean level demanded of each service, 0 for none, shape (services,)."""
     return np.zeros(len(bound.network.services)) if bound.min_service is None else bound.min_service
+
+
+def _trials(bound: Bound) -> Trials:
+    return Trials(simulate_plan, partial(objective, bound), demand(bound), bound.aims)
 
 
 def refine(

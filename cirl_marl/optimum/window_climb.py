@@ -7,6 +7,7 @@ that its plan may be far too impure. It is where ``climb`` begins, as it does wi
 from __future__ import annotations
 
 from dataclasses import replace
+from operator import attrgetter
 from typing import Annotated
 
 import numpy as np
@@ -78,16 +79,12 @@ def climb_window(
         accounts = outcome.accounts[None]
         return WindowEpisode(outcome.value / share, levels, outcome.stock, outcome.flow, accounts, bookings)
 
-    def value(run: WindowEpisode, price: Floats) -> float:
-        lacks = np.maximum(0.0, demand - run.episode_levels[0])
-        return run.value - float(price @ np.concatenate([lacks, aims.excess(run)]))
-
     demand = np.zeros(len(future.network.services)) if task.demand is None else task.demand
     later = future.later(task)
     if later is not None:
         later = replace(later, cost=later.cost / share, level_cost=later.level_cost / share)
     span = Span(future.places(task.intervals).start, later, future.account_rates(task), free)
-    trials = Trials(simulate, value, demand, span)
+    trials = Trials(simulate, attrgetter("value"), demand, aims, span)
     budgets = len(task.limits)
     services = np.zeros(len(demand)) if task.demand is None else task.price[budgets:]
     price = np.concatenate([services, task.price[:budgets] / (share * future.aims.sizes[:budgets])])
