@@ -186,9 +186,11 @@ def test_mpc_approaches_one_demand_and_leaves_the_other() -> None:
     """Homes come as near as they can, for which cars neither starve nor are built beyond what is asked."""
     env = MultiAgentVectorEnv(town(cars=0.0, homes=1.0), num_envs=1)
     most = rollout(env, Constant({"to_cars": 1.0, "to_homes": 1.0})).episode_levels[0, 1]
-    for horizon in (None, 4):
-        run = rollout(env, MPC(min_service=[0.3, 0.99], horizon=horizon))
+    found = bound(env.network, min_service=[0.3, most - 1e-3])
+    for horizon, replan in ((None, None), (4, None), (None, 1), (4, 1)):
+        run = rollout(env, MPC(min_service=[0.3, 0.99], horizon=horizon, replan=replan))
         np.testing.assert_allclose(run.episode_levels[0], [0.3, most], atol=2e-3)
+        assert found.gap(run.episode_circularity)[0] < 0.01  # what is out of reach costs no more than it takes
 
 
 def test_episodes_are_held_against_what_each_service_got() -> None:
