@@ -158,7 +158,7 @@ class Trials:
         shortages = self.shortages(run)
         return float(shortages[shortages > TOLERATED_SHORTFALL].sum())
 
-    def attained(self, run: Any) -> Trials:
+    def within_reach(self, run: Any) -> Trials:
         """Return trials that demand no more than an episode keeps."""
         levels: Floats = np.minimum(self.demand, run.episode_levels[0])
         return replace(self, demand=levels, aims=self.aims.with_lower_budgets(-self.aims.excess(run)))
@@ -195,7 +195,7 @@ def climb(
     options = rounds, enough, progress, least_gain, may_rise
     best, run, price = _ascend(plan, trials, price, *options)
     if may_rise and trials.total_shortage(run) > 0 and not enough(run):
-        best, _, price = _ascend(best, trials.attained(run), price, *options)
+        best, _, price = _ascend(best, trials.within_reach(run), price, *options)
     progress(1.0)
     return best, price
 
@@ -217,7 +217,7 @@ def _ascend(
     value, trust, slopes = trials.value(run, price), TRUST, None
     has_contents, is_leap = any(service.substance for service in plan.network.services), False
     shortfall = trials.total_shortage(run)
-    nearest, nearest_run, nearest_shortfall, needed, vain_rises = plan, run, shortfall, price.copy(), 0
+    nearest, nearest_shortfall, vain_rises = (plan, run, price.copy()), shortfall, 0
     for done in range(EXTENSION * rounds if may_rise else rounds):
         is_short = trials.shortages(run) > TOLERATED_SHORTFALL
         if done >= rounds and not is_short.any():
@@ -251,14 +251,14 @@ def _ascend(
             if shortfall < nearest_shortfall - TOLERATED_SHORTFALL:
                 vain_rises = 0
             if shortfall <= nearest_shortfall:  # at other prices less may be kept later
-                nearest, nearest_run, nearest_shortfall, needed = best, run, shortfall, price.copy()
+                nearest, nearest_shortfall = (best, run, price.copy()), shortfall
             value, slopes = value + step.gain, None
             is_stalled = may_rise and step.gain < STALL * float(price @ np.append(lack, excess))
             trust = 0.0 if is_stalled else min(1.0, 2 * trust)
             is_leap = is_leap and is_stalled
         else:
             trust = 0.0 if is_leap or not any(steps) else trust / 4
-    return (nearest, nearest_run, needed) if may_rise else (best, run, price)
+    return nearest if may_rise else (best, run, price)
 
 
 @positional_record
