@@ -180,8 +180,8 @@ def test_what_cannot_be_asked(options: dict[str, Any], message: str) -> None:
 @pytest.mark.parametrize(
     ("control", "demanded", "solver", "gap", "message"),
     [
-        ("mpc", 0.9, "exact", 0.01, "--gap goes with --control optimum and --min-service"),
-        ("optimum", None, "exact", 0.01, "--gap goes with --control optimum and --min-service"),
+        ("mpc", 0.9, "exact", 0.01, "--gap 0.01 goes with --control optimum and --min-service"),
+        ("optimum", None, "exact", 0.01, "--gap 0.01 goes with --control optimum and --min-service"),
         ("optimum", 0.9, "exact", 0.0, "gap 0.0 must be positive"),
         ("optimum", 0.9, "rk4", 0.01, "no bound is proved: solver 'rk4'"),
     ],

@@ -325,6 +325,8 @@ BAD: dict[str, tuple[dict[str, str], str]] = {
     "no episodes": ({"episodes": "0"}, "row 2: episodes must be a whole number of at least 1, got 0"),
     "too many episodes": ({"episodes": "99"}, r"row '.*/ppo/401': task .* has 64 episodes, got episodes 99"),
     "negative seed": ({"seed": "-1"}, "row 2: seed must be"),
+    "nobody": ({"algorithm": " "}, "row 2: algorithm is empty; name one of the suite, or your own"),
+    "a seed of nobody": ({"algorithm": "neutral"}, "row 2: seed 401: 'neutral' is not trained; leave it empty"),
     "only a variant": ({"variant": "1"}, "has no rows but those of held-out variants to rerun"),
 }
 
@@ -475,7 +477,8 @@ def test_commands(
     assert "nobody has rows on every task" in capsys.readouterr().err
     assert run(monkeypatch, "benchmark", "run", TASK, "--algorithm", "neutral", "--out", mine, "--on", "here") == 0
     assert f"{TASK}/neutral: λ̄" in capsys.readouterr().out
-    assert run(monkeypatch, "benchmark", "run", TASK, "--seeds", "one") == 2
+    for seeds in ("one", ""):
+        assert run(monkeypatch, "benchmark", "run", TASK, "--seeds", seeds) == 2
     assert "must be whole numbers" in capsys.readouterr().err
 
 

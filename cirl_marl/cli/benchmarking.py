@@ -49,7 +49,9 @@ def run(
     try:
         numbers = None if seeds is None else [int(text) for text in common.comma_separated(seeds)]
     except ValueError:
-        raise CirlError(f"--seeds {seeds}: must be whole numbers, such as 401,402") from None
+        numbers = []
+    if numbers == []:
+        raise CirlError(f"--seeds '{seeds}': must be whole numbers, such as 401,402")
     before: dict[str, str] = {}
     outcome = benchmarked(
         names or None,

@@ -72,7 +72,7 @@ def plan(
     if smooth is not None and control != "optimum":
         raise CirlError("--smooth and --no-smooth go with --control optimum")
     if gap is not None and (control != "optimum" or min_service is None):
-        raise CirlError("--gap goes with --control optimum and --min-service")
+        raise CirlError(f"--gap {gap:g} goes with --control optimum and --min-service")
     options = {"min_service": min_service, "smooth": smooth, "gap": gap, "aim": aim, "at_most": at_most}
     env, controller = _environment_and_controller(source, control, scenario, options)
     table = schedule(env, controller, seed=seed, progress=progress)

@@ -101,6 +101,10 @@ def read_rows(path: Path = KEPT_RESULTS) -> list[ResultRow]:
         check_names("task", [row.task], tasks(), f"{place}: ", RunError)
         with _error_place(place):
             task_of(row)
+        if not row.algorithm.strip():
+            raise RunError(f"{place}: algorithm is empty; name one of the suite, or your own")
+        if row.algorithm in CONTROLLERS and row.seed is not None:
+            raise RunError(f"{place}: seed {row.seed}: '{row.algorithm}' is not trained; leave it empty")
         if rows.setdefault(key_of(row), row) is not row:
             raise RunError(f"{place}: '{row.id}', variant {row.variant}, is there already")
     return [*rows.values()]
