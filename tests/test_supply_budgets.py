@@ -295,7 +295,7 @@ def test_the_plan_that_is_least_short_counts(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(improve, "best_values", lambda *about: next(steps, None))
     trials = improve.Trials(episode, attrgetter("worth"), np.zeros(0), limited(0.0))
     plan: Any = Planned(np.zeros((1, 1)), harbour())
-    best, price = improve.climb(plan, trials, np.ones(1), rounds=20)
+    best, price = improve.climb(plan, trials, np.ones(1), rounds=40)
     assert best.actions == pytest.approx(0.1)
     assert max(charged) == improve.DEARER**improve.VAIN_RISES
     assert price[0] == charged[-1] == 1.0  # what it takes to keep what was kept

@@ -56,7 +56,7 @@ more, as it is too impure, or to stocks that schedules empty, by wide slopes."""
 DEARER = 10.0
 """By what prices of what is short rise where no step helps: beside contents, budgets and flows that the simulator cuts
 only from empty donors the bound knows low ones."""
-VAIN_RISES = 3
+VAIN_RISES = 8
 """How often prices rise in vain, before what is out of reach is asked for as far as it was had."""
 STALL = 0.05
 """Part of what is charged for what is short, which a step has to gain if prices are to stay there."""
