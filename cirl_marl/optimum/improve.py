@@ -57,7 +57,7 @@ DEARER = 10.0
 """By what prices of what is short rise where no step helps: beside contents, budgets and flows that the simulator cuts
 only from empty donors the bound knows low ones."""
 VAIN_RISES = 8
-"""How often prices rise in vain, before what is out of reach is asked for as far as it was had."""
+"""How often prices rise in a row while no less is short."""
 STALL = 0.05
 """Part of what is charged for what is short, which a step has to gain if prices are to stay there."""
 EXTENSION = 3
@@ -158,11 +158,6 @@ class Trials:
         shortages = self.shortages(run)
         return float(shortages[shortages > TOLERATED_SHORTFALL].sum())
 
-    def within_reach(self, run: Any) -> Trials:
-        """Return trials that demand no more than an episode keeps."""
-        levels: Floats = np.minimum(self.demand, run.episode_levels[0])
-        return replace(self, demand=levels, aims=self.aims.with_lower_budgets(-self.aims.excess(run)))
-
 
 def climb(
     plan: P,
@@ -178,7 +173,7 @@ def climb(
     """Return a plan with better actions, by linear programs around episodes, from its own, and the price it needed.
 
     Where contents are demanded or there are budgets, or with ``demand_first``, prices rise of what is short and no step
-    helps. What is out of reach even so is asked for as far as it was had, and the objective improved beside that.
+    helps. Where rises are in vain, what is short is out of reach, and the plan that is least short counts.
 
     Args:
         plan: with the actions to start from.
@@ -191,33 +186,14 @@ def climb(
         least_gain: as in ``improve_plan``.
         demand_first: whether what is demanded comes before the price that it has at first.
     """
-    may_rise = any(s.substance for s in plan.network.services) or bool(trials.aims.budgets) or demand_first
-    options = rounds, enough, progress, least_gain, may_rise
-    best, run, price = _ascend(plan, trials, price, *options)
-    if may_rise and trials.total_shortage(run) > 0 and not enough(run):
-        best, _, price = _ascend(best, trials.within_reach(run), price, *options)
-    progress(1.0)
-    return best, price
-
-
-def _ascend(
-    plan: P,
-    trials: Trials,
-    price: Floats,
-    rounds: int,
-    enough: Callable[[Any], bool],
-    progress: Callable[[float], None],
-    least_gain: float,
-    may_rise: bool,
-) -> tuple[P, Any, Floats]:
-    """Return the plan that is least short, its episode and the price at which it was found; see ``climb``."""
     dynamics, demand, aims, price = Dynamics(plan.network), trials.demand, trials.aims, price.copy()
     lack, excess = np.zeros(len(demand)), np.zeros(len(aims.budgets))
     best, run = plan, trials.simulate(plan)
     value, trust, slopes = trials.value(run, price), TRUST, None
     has_contents, is_leap = any(service.substance for service in plan.network.services), False
+    may_rise = has_contents or bool(aims.budgets) or demand_first
     shortfall = trials.total_shortage(run)
-    nearest, nearest_shortfall, vain_rises = (plan, run, price.copy()), shortfall, 0
+    nearest, nearest_shortfall, vain_rises = (plan, price.copy()), shortfall, 0
     for done in range(EXTENSION * rounds if may_rise else rounds):
         is_short = trials.shortages(run) > TOLERATED_SHORTFALL
         if done >= rounds and not is_short.any():
@@ -251,14 +227,15 @@ def _ascend(
             if shortfall < nearest_shortfall - TOLERATED_SHORTFALL:
                 vain_rises = 0
             if shortfall <= nearest_shortfall:  # at other prices less may be kept later
-                nearest, nearest_shortfall = (best, run, price.copy()), shortfall
+                nearest, nearest_shortfall = (best, price.copy()), shortfall
             value, slopes = value + step.gain, None
             is_stalled = may_rise and step.gain < STALL * float(price @ np.append(lack, excess))
             trust = 0.0 if is_stalled else min(1.0, 2 * trust)
             is_leap = is_leap and is_stalled
         else:
             trust = 0.0 if is_leap or not any(steps) else trust / 4
-    return nearest if may_rise else (best, run, price)
+    progress(1.0)
+    return nearest if may_rise else (best, price)
 
 
 @positional_record
