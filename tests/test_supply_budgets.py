@@ -294,6 +294,11 @@ def test_the_plan_that_is_least_short_counts(monkeypatch: pytest.MonkeyPatch) ->
     assert best.actions == pytest.approx(0.1)
     assert max(charged) == improve.DEARER**improve.VAIN_RISES
     assert price[0] == 1.0  # what it takes to keep what was kept
+    charged.clear()
+    late = iter([np.array([0.1])])
+    monkeypatch.setattr(improve, "best_values", lambda *about: next(late, None) if charged[-1] >= 100 else None)
+    _, price = improve.climb(plan, trials, np.ones(1), rounds=60)
+    assert price[0] == 100.0 and max(charged) == 100 * improve.DEARER**improve.VAIN_RISES  # counted anew
 
 
 def test_a_step_lets_supplies_fall_and_no_further_than_to_nothing() -> None:
