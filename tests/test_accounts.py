@@ -139,8 +139,10 @@ def test_infos_hold_what_each_interval_and_the_episode_book() -> None:
     for _ in range(3):
         *_, infos = batch.step(batch.neutral_action)
     final = next(iter(infos.values()))["final_info"]
-    assert final["episode_emissions"].shape == final["episode_cost"].shape == (2,)
-    assert (final["episode_emissions"] > 0).all() and (sums > 0).all()
+    totals = final["episode_accounts"]
+    assert totals["emissions"].shape == totals["cost"].shape == (2,)
+    assert (totals["emissions"] > 0).all() and (sums > 0).all()
+    assert not any(name in final for name in ("episode_emissions", "episode_cost")), "costs of safety have such names"
 
 
 def test_infos_hold_what_regions_and_compartments_book() -> None:

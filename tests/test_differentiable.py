@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -75,6 +76,15 @@ def test_steps_need_a_start() -> None:
     """And say so."""
     with pytest.raises(ControlError, match="call reset"):
         DifferentiableEnv(NETWORK, num_envs=1).step(torch.zeros(1, 1))
+
+
+@pytest.mark.parametrize("actions", [torch.zeros(99, 2), torch.zeros(2), np.zeros((1, 2)), None])
+def test_actions_are_checked(actions: Any) -> None:
+    """What was given, and what is expected."""
+    env = DifferentiableEnv(NETWORK, num_envs=2)
+    env.reset(seed=0)
+    with pytest.raises(ControlError, match=r"actions are a tensor of shape \(\d+, 2\), got (shape|ndarray|NoneType)"):
+        env.step(actions)
 
 
 def test_gradients_of_what_is_booked() -> None:

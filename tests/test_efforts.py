@@ -227,7 +227,7 @@ def test_flows_that_are_less_than_asked_prove_no_effort(reason: str) -> None:
         amounts = env.step(actions)[-1][agent]
     asked = network.control_bounds[1, 0, 0] * (2.0 if reason == "shares" else 1.0)
     assert amounts["flows"][0, network.arc_index[agent]] < 0.9 * asked
-    assert -solved.objective <= float(amounts["episode_cost"][0]) + 1e-6
+    assert -solved.objective <= float(amounts["episode_accounts"]["cost"][0]) + 1e-6
 
 
 @given(network=substances_networks, seed=st.integers(0, 1000))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -192,3 +193,23 @@ def test_schedules_are_checked() -> None:
     for shape in ((3, 15), (4, 16), (2, 16, 3), (0, 16)):
         with pytest.raises(ControlError, match=r"actions have shape .* expected \(intervals, 16\)"):
             cirl_marl.gradient(env, np.zeros(shape))
+
+
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [
+        ({"levels": [1, 2, 3]}, r"levels have shape \(3,\), expected a number, or \(1,\) or \(1, 2\)"),
+        ({"levels": np.ones((2, 1))}, r"levels have shape \(2, 1\)"),
+        ({"levels": np.nan}, "levels nan are not finite"),
+        ({"levels": "a"}, "levels 'a' are no numbers"),
+        ({"circularity": [1, 2, 3]}, r"circularity have shape \(3,\), expected a number, or \(2,\)$"),
+        ({"accounts": [1.0]}, r"accounts have shape \(1,\), expected a number, or \(0,\) or \(0, 2\)"),
+    ],
+)
+def test_weights_are_checked(weights: dict[str, Any], message: str) -> None:
+    """Name, what was given and what is expected; the environment stays where it is."""
+    env = MultiAgentVectorEnv("copper_net", num_envs=2, horizon=3)
+    env.reset(0)
+    with pytest.raises(ControlError, match=message):
+        cirl_marl.gradient(env, np.zeros((3, 16)), **weights)
+    assert (env.physical.step == 0).all()

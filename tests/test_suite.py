@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+from collections.abc import Iterator
 from dataclasses import fields, replace
 from functools import partialmethod
 from pathlib import Path
@@ -176,10 +177,15 @@ def test_held_out_variants_have_other_numbers() -> None:
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder of a benchmark with a learner's row, of a training of some seconds, and neutral control's."""
-    folder, patch = tmp_path_factory.mktemp("suite"), pytest.MonkeyPatch()
-    patch.setattr(declared.SuiteAlgorithm, "steps", lambda algorithm, task: 2 * 32 * 160)
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Yield the folder of a benchmark with a learner's row, of a training of some seconds, and neutral control's."""
+    folder, patch, budget = tmp_path_factory.mktemp("suite"), pytest.MonkeyPatch(), pytest.MonkeyPatch()
+    whole = declared.SuiteAlgorithm.steps
+
+    def few(algorithm: declared.SuiteAlgorithm, task: declared.BenchmarkTask) -> int:
+        return 2 * 32 * 160 if algorithm.name == "ppo" else whole(algorithm, task)
+
+    budget.setattr(declared.SuiteAlgorithm, "steps", few)
 
     def keep(run: Path) -> None:
         if run.is_dir():
@@ -191,7 +197,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     patch.undo()
     assert not outcome.failures
-    return folder
+    yield folder
+    budget.undo()
 
 
 def test_a_row_is_made_once(trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -325,6 +332,11 @@ BAD: dict[str, tuple[dict[str, str], str]] = {
     "no episodes": ({"episodes": "0"}, "row 2: episodes must be a whole number of at least 1, got 0"),
     "too many episodes": ({"episodes": "99"}, r"row '.*/ppo/401': task .* has 64 episodes, got episodes 99"),
     "negative seed": ({"seed": "-1"}, "row 2: seed must be"),
+    "another seed": ({"seed": "402"}, r"row '.*/ppo/402': seed is 402, but that of the policies 401"),
+    "other steps": ({"steps": "7"}, r"row '.*/ppo/401': steps is 7, but that of the policies 10240"),
+    "another algorithm": ({"algorithm": "sac"}, r"row '.*/sac/401': algorithm is sac, but that of the policies ppo"),
+    "out of the folder": ({"weights": "../a.safetensors"}, r"row 2: weights '\.\./a\.safetensors' are not below the"),
+    "anywhere": ({"weights": "/tmp/a.safetensors"}, "row 2: weights '/tmp/a.safetensors' are not below the folder"),
     "nobody": ({"algorithm": " "}, "row 2: algorithm is empty; name one of the suite, or your own"),
     "a seed of nobody": ({"algorithm": "neutral"}, "row 2: seed 401: 'neutral' is not trained; leave it empty"),
     "only a variant": ({"variant": "1"}, "has no rows but those of held-out variants to rerun"),
@@ -338,6 +350,24 @@ def test_bad_rows_are_named(trained: Path, tmp_path: Path, case: str) -> None:
     table = changed(trained, tmp_path, **cells)
     with pytest.raises(CirlError, match=message):
         verify(table)
+
+
+def test_rows_of_other_names_have_other_budgets(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An algorithm of the suite has the steps of the suite; a name of one's own, as many as were made."""
+    monkeypatch.setattr(declared.SuiteAlgorithm, "steps", lambda algorithm, task: 5 * 160)
+    with pytest.raises(RunError, match=r"row '.*/ppo/401': steps are 10,240, where 'ppo' has 800: give it"):
+        verify(changed(trained, tmp_path))
+    assert verify(changed(trained, tmp_path, algorithm="mine")) == [f"{TASK}/mine/401"]
+
+
+@pytest.mark.parametrize("repeated", ["tasks", "algorithms", "seeds"])
+def test_what_is_asked_for_twice_is_named_before_anything_is_done(tmp_path: Path, repeated: str) -> None:
+    """Nothing is left behind."""
+    asked: dict[str, Any] = {"tasks": [TASK], "algorithms": ["ppo"], "seeds": [401]}
+    asked[repeated] *= 2
+    with pytest.raises(CirlError, match=f"{repeated.removesuffix('s')} {asked[repeated][0]} is given more than once"):
+        cirl_marl.benchmark(asked.pop("tasks"), **asked, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_bad_tables_and_files_are_named(trained: Path, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -348,12 +349,14 @@ def test_every_view_draws() -> None:
     network = load_network(EXAMPLE).scenario("business_as_usual")
     parallel = parallel_env(network, uncertain=True)
     _, infos = parallel.reset(seed=3)
-    told = infos[parallel.agents[0]]["drawn"]
+    told = infos[parallel.agents[0]]["drawn"].copy()
+    infos[parallel.agents[0]]["drawn"] *= 3.0  # whoever normalises in place changes no physics
     *_, infos = parallel.step({agent: space.sample() for agent, space in parallel.action_spaces.items()})
     np.testing.assert_array_equal(infos[parallel.agents[0]]["drawn"], told)
     single = single_agent_env(network, agent=parallel.agents[0], uncertain=True)
     np.testing.assert_array_equal(single.reset(seed=3)[1]["drawn"], told)
     np.testing.assert_array_equal(single.step(single.action_space.sample())[-1]["drawn"], told)
+    check_env(single, skip_render_check=True)
 
 
 def rates_of_draws(network: Network) -> tuple[Floats, Floats, Floats]:

@@ -214,7 +214,7 @@ def test_mpc_keeps_budgets_per_year(replan: int, share: float | None) -> None:
         infos = outcome[-1][env.agents[0]]
         amounts[episode, step] = infos["accounts"]["emissions"]
         if step == 7:
-            totals[episode] = infos["episode_emissions"]
+            totals[episode] = infos["episode_accounts"]["emissions"]
     booked = amounts.reshape(2, 2, 4, 2).sum(axis=2)
     assert (booked <= budgets["emissions/year"] * (1 + 1e-4)).all()
     if share is None:

@@ -76,10 +76,14 @@ class DifferentiableEnv:
             service levels, shape (services, B); double precision.
 
         Raises:
-            ControlError: for NaN, values out of bounds, or an episode that is over or not begun.
+            ControlError: for another shape, NaN, values out of bounds, or an episode that is over or not begun.
         """
         if self._stock is None:
             raise ControlError("the environment has no state yet: call reset() first")
+        shape = (len(self.env.actuators.control_rows), self.env.num_envs)
+        if not isinstance(actions, Tensor) or actions.shape != shape:
+            what = f"shape {tuple(actions.shape)}" if isinstance(actions, Tensor) else type(actions).__name__
+            raise ControlError(f"actions are a tensor of shape {shape}, got {what}")
         outputs: Any = _Interval.apply(self._derivatives, self._stock, actions, self.disturbances)  # type: ignore[no-untyped-call]
         self._stock, circularity, levels, observation, self.bookings = outputs
         return observation, circularity, levels

@@ -67,7 +67,7 @@ def run(
     for row in outcome.rows:
         variant = f", variant {row.variant}" if row.variant else ""
         common.say(f"{row.id}{variant}: λ̄ {row.circularity:.5g}, service {row.service:.4f}, gap {row.gap:.2%}")
-    common.say(f"{len(outcome.rows)} rows in {folder / 'results.csv'}")
+    common.say(f"rows asked for: {len(outcome.rows)}, in {folder / 'results.csv'}")
     common.end_with(outcome.failures)
 
 

@@ -126,13 +126,13 @@ class Derivatives:
         """Return ``gradient`` of actions that have its shape."""
         env, (steps, _, batch) = self.env, actions.shape
         state, controls, services = env.physical, env.controls, len(env.network.services)
+        by_circularity = _weights("circularity", circularity, (batch,)) / steps
+        by_level = _weights("levels", levels, (services, batch)) / steps
+        by_account = _weights("accounts", accounts, (len(env.ledger.accounts), batch))
         try:
             tape = [(env.advance(action), env.interval) for action in actions]
         finally:
             env.go_back(state, controls)
-        by_circularity = np.broadcast_to(np.asarray(circularity, dtype=float), (batch,)) / steps
-        by_level = _columns(levels, (services, batch)) / steps
-        by_account = _columns(accounts, (len(env.ledger.accounts), batch))
         stock, draws = np.zeros_like(state.stock), np.zeros_like(state.factors)
         paths, by_action = np.zeros_like(state.disturbances), np.empty(actions.shape)
         for t in reversed(range(steps)):
@@ -145,10 +145,22 @@ class Derivatives:
         return Gradient(mean_circularity, mean_levels, totals, by_action, stock[env.rows.nodes], paths, draws)
 
 
-def _columns(weights: ArrayLike, shape: tuple[int, int]) -> Floats:
-    """Return weights, a number, one for each row or of this shape, in it."""
-    array = np.asarray(weights, dtype=float)
-    return np.broadcast_to(array if array.ndim == 2 else array.reshape(-1, 1), shape)
+def _weights(name: str, weights: ArrayLike, shape: tuple[int, ...]) -> Floats:
+    """Return weights, a number, one for each row or of this shape, in it.
+
+    Raises:
+        ControlError: for others, and for what is not finite.
+    """
+    try:
+        array = np.asarray(weights, dtype=float)
+    except (TypeError, ValueError):
+        raise ControlError(f"{name} {weights!r} are no numbers") from None
+    if array.shape not in ((), shape[:1], shape):
+        expectation = " or ".join(map(str, dict.fromkeys((shape[:1], shape))))
+        raise ControlError(f"{name} have shape {array.shape}, expected a number, or {expectation}")
+    if not np.isfinite(array).all():
+        raise ControlError(f"{name} {array.tolist()} are not finite")
+    return np.broadcast_to(array[:, None] if array.shape != shape and array.ndim else array, shape)
 
 
 def gradient(
@@ -176,7 +188,7 @@ def gradient(
     Raises:
         CirlError: for what has no derivative: compartments with models, batches, other solvers than ``exact``, and
             stocks that recipients empty; names the network, the compartment and the reason.
-        ControlError: for actions of another shape or out of bounds.
+        ControlError: for actions of another shape or out of bounds, and for weights of another shape or not finite.
     """
     return Derivatives(env).open_loop(stacked_schedule(env, actions), circularity, levels, accounts)
 

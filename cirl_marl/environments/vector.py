@@ -59,6 +59,7 @@ class MultiAgentVectorEnv:
     ``final_info``                 the info of its last step, and as ``state`` what ``state()`` was at its end
     ``episode_circularity``        mean of λ over the episode, mass
     ``episode_service_level``      mean of the service level over the episode
+    ``episode_accounts``           discounted total on each account, a dict account → shape (B,), if there are any
     =============================  ====================================================================================
 
     Attributes:
@@ -377,7 +378,7 @@ class MultiAgentVectorEnv:
 
     def drawn_info(self, step: Integers) -> dict[str, Any]:
         """Return what infos say of what an episode drew and what disturbs an interval of each copy, shape (B,)."""
-        info: dict[str, Any] = {"drawn": self.physical.factors.T} if self.uncertain else {}
+        info: dict[str, Any] = {"drawn": self.physical.factors.T.copy()} if self.uncertain else {}
         if names := self._starts.processes.names:
             values = interval_of(self.physical.disturbances, step).view()
             values.setflags(write=False)
@@ -527,14 +528,16 @@ class MultiAgentVectorEnv:
             info |= {"final_obs": final[agent], "final_info": {**info, "state": state}}
             info |= {"_final_obs": over, "_final_info": over}
 
-    def episode_figures(self) -> dict[str, Floats]:
-        """Return λ̄, the mean service level and amounts on accounts up to now, shape (B,) each, as infos name them."""
+    def episode_figures(self) -> dict[str, Any]:
+        """Return λ̄, the mean service level and totals on accounts up to now, shape (B,) each, as infos name them."""
         state = self.physical
         steps = np.maximum(state.step, 1)
         service = self.scoring.service_level(state.service / steps)
         figures = {"episode_circularity": state.circularity / steps, "episode_service_level": service}
-        totals = zip(self.ledger.accounts, state.accounts, strict=True)
-        return figures | {f"episode_{account}": total for account, total in totals}
+        amounts = state.accounts.view()
+        amounts.setflags(write=False)
+        totals = dict(zip(self.ledger.accounts, amounts, strict=True))
+        return figures | ({"episode_accounts": totals} if totals else {})
 
     def _restart(self, over: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Start the next episode in copies whose last is ``over``, shape (B,), and return the observation of all."""

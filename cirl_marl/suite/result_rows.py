@@ -12,10 +12,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from filelock import FileLock
 
+from cirl_marl.controllers.basic import Controller
 from cirl_marl.errors import CirlError, RunError, check_names, whole_number
 from cirl_marl.network.declarations import KeptRecord, frozen_record
 from cirl_marl.records.files import sha256_of, write_table
-from cirl_marl.suite.tasks import CONTROLLERS, PACKAGE_DATA, BenchmarkTask, Figures, load_task, tasks
+from cirl_marl.suite.tasks import (
+    CONTROLLERS,
+    PACKAGE_DATA,
+    BenchmarkTask,
+    Figures,
+    algorithms,
+    load_algorithm,
+    load_task,
+    tasks,
+)
 from cirl_marl.suite.weights import controller_of
 
 if TYPE_CHECKING:
@@ -105,6 +115,8 @@ def read_rows(path: Path = KEPT_RESULTS) -> list[ResultRow]:
             raise RunError(f"{place}: algorithm is empty; name one of the suite, or your own")
         if row.algorithm in CONTROLLERS and row.seed is not None:
             raise RunError(f"{place}: seed {row.seed}: '{row.algorithm}' is not trained; leave it empty")
+        if (weights := Path(row.weights)).is_absolute() or ".." in weights.parts:
+            raise RunError(f"{place}: weights '{row.weights}' are not below the folder of the table")
         if rows.setdefault(key_of(row), row) is not row:
             raise RunError(f"{place}: '{row.id}', variant {row.variant}, is there already")
     return [*rows.values()]
@@ -176,8 +188,9 @@ def verify(path: Path = KEPT_RESULTS, ids: Sequence[str] = (), *, variants: bool
 
     Raises:
         CirlError: for an id that the table does not have.
-        RunError: for a table without such rows, weights that are missing or others than the row's, or figures that a
-            rerun does not give; it names file, row, column and both values.
+        RunError: for a table without such rows, weights that are missing or others than the row's, another seed,
+            algorithm or number of steps than theirs, or figures that a rerun does not give; it names file, row, column
+            and both values.
     """
     rows = [row for row in read_rows(path) if variants or not row.variant]
     if not rows:
@@ -201,11 +214,27 @@ def _verify(path: Path, row: ResultRow) -> None:
             raise RunError(f"{place}: {weights} has another SHA-256, {actual}, than the row, {row.sha256}")
     with _error_place(place):
         controller, options = controller_of(task, row.algorithm, weights)
+        _check_training(row, controller)
         figures = columns_of(task.measure(controller, episodes=row.episodes, **options))
     for name, now in figures.items():
         if not is_reproduced(row, name, now):
             digits, rerun = (FORMS[name].format(figure) for figure in (getattr(row, name), now))
             raise RunError(f"{place}: {name} is {digits}, a rerun gives {rerun}")
+
+
+def _check_training(row: ResultRow, controller: Controller) -> None:
+    """Refuse a row that says something else of how its policies were trained than they do."""
+    run, is_of_suite = getattr(controller, "run", None), row.algorithm in algorithms()
+    if run is None and not is_of_suite:
+        return
+    made = {"seed": None, "steps": 0} if run is None else {"seed": run.config.seed, "steps": run.config.steps}
+    if is_of_suite:
+        made |= {"algorithm": "" if run is None else run.config.recipe.name}
+    for name, value in made.items():
+        if (stated := getattr(row, name)) != value:
+            raise RunError(f"{name} is {stated}, but that of the policies {value}")
+    if is_of_suite and row.steps != (budget := load_algorithm(row.algorithm).steps(load_task(row.task))):
+        raise RunError(f"steps are {row.steps:,}, where '{row.algorithm}' has {budget:,}: give it another name")
 
 
 def is_reproduced(row: ResultRow, name: str, now: float) -> bool:
