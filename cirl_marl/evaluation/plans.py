@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from cirl_marl.controllers import Controller
@@ -17,11 +18,14 @@ from cirl_marl.errors import CirlError, path_of
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Network
 from cirl_marl.network.elements import CIRCULARITY
-from cirl_marl.optimum.aims import Aim, budget_texts
-from cirl_marl.optimum.bounds import Bound, gap
+from cirl_marl.optimum.aims import Aim, aims_of, budget_texts
+from cirl_marl.optimum.bounds import Bound, bound, gap
 from cirl_marl.optimum.open_loop import Optimum
 from cirl_marl.optimum.options import lack_texts, levels_text
 from cirl_marl.optimum.registry import CONTROLLERS, named_controller
+
+LOOSE, TOLERANCE = 0.05, 1e-6
+"""Gap beyond which a bound on λ̄ and service together says little of λ̄, and level within which a solver is exact."""
 
 
 def plan(
@@ -83,7 +87,8 @@ def plan(
 def _proof(controller: Controller, table: Schedule) -> str:
     """Say what λ̄ no episode with this service exceeds, and how far the plan stays below; empty where nothing does.
 
-    Of λ̄/scale + w·service ≤ β follows λ̄ ≤ scale·(β − w·service) for all that serve as much. Of a disturbed network the
+    Of λ̄/scale + w·service ≤ β follows λ̄ ≤ scale·(β − w·service) for all that serve as much; where the network cannot
+    serve as its relaxation does that says little, and a bound at this service is solved. Of a disturbed network the
     program is that of what is expected, which bounds no episode.
     """
     if table.network.disturbed:
@@ -95,6 +100,10 @@ def _proof(controller: Controller, table: Schedule) -> str:
     if solution.service_weight is not None:
         limit -= solution.service_weight * float(run.episode_service[0])
         limit, demand = limit * network.objective.circularity_scale, "this service"
+        if gap(limit, aims.value(run)) > LOOSE:
+            served = np.maximum(run.episode_levels[0] - TOLERANCE, 0.0)
+            at_service = bound(network, solution.initial, min_service=served, agents=solution.agents or None)
+            limit = min(limit, at_service.objective)
     elif solution.min_service is not None:
         demand = f"a service of at least {levels_text(network, solution.min_service)}"
     unit = "λ̄/scale" if solution.service_weight is not None else aims.unit(network)
@@ -120,6 +129,7 @@ def _environment_and_controller(
             raise CirlError(f"plan {source}: is a training run, which acts by its policies; leave out --control")
         env = MultiAgentVectorEnv(source, num_envs=1, scenario=scenario)
         if isinstance(control, str):
+            aims_of(env.network, options["aim"], options["at_most"], with_services=True)  # names what is unknown first
             control = named_controller(control, **options)
         return env, control
     if run is None:

@@ -86,7 +86,7 @@ def search(
     scenario: str | None = None,
     horizon: int | None = None,
     candidates: Mapping[str, Controller] | None = None,
-    knots: int = KNOTS,
+    knots: int | None = None,
     population: int = 64,
     iterations: int = 30,
     seed: int = 0,
@@ -111,7 +111,7 @@ def search(
         horizon: decisions per episode; None takes the definition's.
         candidates: name → controller; None takes ``standard_candidates``.
         knots: stretches of the episode in which deviations are constant, at most one for each decision; the search
-            begins with a single one and ends with these.
+            begins with a single one and ends with these. None: KNOTS, or where there are fewer decisions one for each.
         population: plans tried in an iteration.
         iterations: of the method; 0 takes the best candidate.
         seed: of the draws; the same seed finds the same plan.
@@ -140,7 +140,7 @@ def search_each(
     min_service: ArrayLike | None = None,
     agents: Sequence[str] | None = None,
     candidates: Mapping[str, Controller] | None = None,
-    knots: int = KNOTS,
+    knots: int | None = None,
     population: int = 64,
     iterations: int = 30,
     seed: int = 0,
@@ -153,6 +153,7 @@ def search_each(
     inner states, the first of ``MultiAgentVectorEnv.state_names``, shape (starts, rows).
     """
     check_options(service_weight, min_service, DEGREE)
+    knots = min(KNOTS, network.episode.horizon) if knots is None else knots
     for name, value, least in (("population", population, 8), ("iterations", iterations, 0), ("knots", knots, 1)):
         whole_number(name, value, least)
     if knots > network.episode.horizon:

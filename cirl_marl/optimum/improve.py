@@ -258,9 +258,10 @@ def _corrected_step(
             break
         if corrected is program and program.promise(values) <= least:
             return None
-        candidate = _with_actions(plan, np.clip(plan.actions + values[program.columns.action], -1.0, 1.0))
-        trial = trials.simulate(candidate)
-        gain = trials.value(trial, price) - value
+        candidate, trial, gain = _tried(plan, values[program.columns.action], trials, price, value)
+        if gain <= 0 and values[program.columns.action][program.idle].any():  # flows that were cut may not be beyond
+            moves = np.where(program.idle, 0.0, values[program.columns.action])
+            candidate, trial, gain = _tried(plan, moves, trials, price, value)
         if gain > best.gain:
             best = _Step(candidate, trial, gain)
         elif best.gain > 0:
@@ -271,9 +272,11 @@ def _corrected_step(
     return best
 
 
-def _with_actions(plan: P, actions: Floats) -> P:
-    result: P = replace(plan, actions=actions)  # type: ignore[type-var]
-    return result
+def _tried(plan: P, moves: Floats, trials: Trials, price: Floats, value: float) -> tuple[P, Any, float]:
+    """Return a plan with actions that have moved, its episode, and the gain."""
+    candidate: P = replace(plan, actions=np.clip(plan.actions + moves, -1.0, 1.0))  # type: ignore[type-var]
+    trial = trials.simulate(candidate)
+    return candidate, trial, trials.value(trial, price) - value
 
 
 def prices(bound: Bound) -> Floats:

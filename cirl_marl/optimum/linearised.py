@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 
 from cirl_marl.dynamics.integrator import Dynamics
@@ -105,6 +106,7 @@ class StepProgram:
     columns: Annotated[StepColumns, "where its variables are"]
     scale: Annotated[Floats, "measure of each variable, shape (variables,)"]
     origin: Annotated[Floats, "its variables if nothing changes, likewise"]
+    idle: Annotated[NDArray[np.bool_], "actions that change nothing to first order, shape (steps, entries)"]
     place: Annotated[Integers, "interval and measure of each of the first rows of G, shape (rows, 2)"]
     measures: Annotated[Measures, "what these read"]
     aims: Annotated[Aims, "whose budgets the last rows of G keep"]
@@ -204,8 +206,11 @@ def step_program(
     measures = Measures.of(network, dynamics, slice(span.first, span.first + steps), margin)
     measure_rows, part_rows, places = _Rows(count), _Rows(count), list[Integers]()
     before = np.empty((slopes.end.shape[1], 0))
+    is_idle = np.ones(count, dtype=bool)
+    is_idle[effort_actions] = False
     for t, response in enumerate(slopes.responses()):
         past, end = moves[: t + 1].ravel(), slopes.end[t]
+        is_idle[past] &= ~response.any(axis=0)
         cost[past] += weights[t] @ response
         budget_rows[:, past] += budget_weights[:, t] @ response
         if span.later is not None:
@@ -264,7 +269,7 @@ def step_program(
         low=low,
         high=high,
     )
-    return StepProgram(problem, columns, scale, origin, np.concatenate(places), measures, aims)
+    return StepProgram(problem, columns, scale, origin, is_idle[columns.action], np.concatenate(places), measures, aims)
 
 
 def _circularity_cost(plan: ActionPlan, dynamics: Dynamics) -> Floats:

@@ -299,9 +299,13 @@ class MPC(Planner):
         if plan is None or self.note:
             return
         network = self._env.network
-        excess = plan.bookings.sum(axis=0) - plan.task.limits
+        excess, units = plan.bookings.sum(axis=0) - plan.task.limits, [account.unit for account in network.accounts]
         pairs = zip(self._aims.budgets, excess.tolist(), strict=True)
-        faults = [f"{part:.2%} more {budget.name}" for budget, part in pairs if part > NOTABLE]
+        faults = [
+            f"{part:.2%} more {budget.name}" if budget.most else f"{part:.4g} {units[budget.account]} of {budget.name}"
+            for budget, part in pairs
+            if part > NOTABLE
+        ]
         if plan.task.demand is not None:
             faults += lack_texts(network, plan.task.demand, plan.level)
         if faults:

@@ -18,7 +18,7 @@ from cirl_marl.optimum.admissible import NoCertificate
 from cirl_marl.optimum.aims import Aim
 from cirl_marl.optimum.bounds import Bound, bound
 from cirl_marl.optimum.closing import close_gap
-from cirl_marl.optimum.cross_entropy import KNOTS, Incumbent, search_each
+from cirl_marl.optimum.cross_entropy import Incumbent, search_each
 from cirl_marl.optimum.improve import improve_plan
 from cirl_marl.optimum.options import check_margin
 from cirl_marl.optimum.planned_episodes import Plan, starting_states
@@ -134,7 +134,6 @@ class Optimum(Planner):
             min_service=self._min_service,
             service_weight=self._service_weight,
             agents=env.agents or None,
-            knots=min(KNOTS, env.network.episode.horizon),
             progress=lambda share, objective: progress(share),
         )
         return [replace(incumbent, network=env.network) for incumbent in incumbents]

@@ -46,13 +46,15 @@ class ContentMeasure:
 class Measures:
     """What rows read off stocks and mean flows.
 
-    Read are each service; stocks that scheduled flows leave, as no others could become negative to first order; and
-    where |φ| counts, −φ and φ, the imbalance, of flows.
+    Read are each service; stocks that scheduled flows leave, as no others could become negative to first order; less
+    each service whose band has an upper end; and where |φ| counts, −φ and φ, the imbalance, of flows.
     """
 
     table: Annotated[Floats, "of stocks and mean flows, shape (measures, stores + arcs)"]
     by_stage: Annotated[Floats, "of rows of Jacobians, shape (measures, rows)"]
     low: Annotated[Floats, "with how much of a service its band begins, shape (services, steps)"]
+    high: Annotated[Floats, "with how much its band ends, infinite where it does not, likewise"]
+    limited: Annotated[Integers, "services that are read once more, whose band ends"]
     contents: Annotated[list[ContentMeasure], "services of contents, of which ``table`` reads masses alone"]
     is_absolute: Annotated[bool, "whether |φ| counts"]
 
@@ -76,7 +78,15 @@ class Measures:
         ]
         donors = np.unique(network.donors[dynamics.is_scheduled[:arcs]])
         is_absolute = network.objective.net_zero == "abs"
-        rows = [*services, *columns[donors[donors < stores]]]
+        low, high = (
+            np.array([network.interval_means(end)[period] for end in ends]).reshape(
+                len(services), period.stop - period.start
+            )
+            for ends in ([s.low for s in network.services], [s.high for s in network.services])
+        )
+        has_end = np.isfinite(high).any(axis=1) & np.array([not s.substance for s in network.services], dtype=bool)
+        limited = np.flatnonzero(has_end)
+        rows = [*services, *columns[donors[donors < stores]], *(-services[s] for s in limited)]
         if is_absolute:
             rows += [sign * np.append(np.zeros(stores), -network.circularity_weights[1]) for sign in (-1.0, 1.0)]
         table = np.array(rows).reshape(-1, len(columns))
@@ -85,26 +95,23 @@ class Measures:
         for store in range(stores):
             by_stage[:, np.atleast_1d(dynamics.rows.stages.get(store, store))] = table[:, [store]]
         by_stage[:, nodes : nodes + arcs] = table[:, stores:]
-        low, high = (
-            np.array([network.interval_means(end)[period] for end in ends]).reshape(
-                len(services), period.stop - period.start
-            )
-            for ends in ([s.low for s in network.services], [s.high for s in network.services])
-        )
         part, whole = service_measures(network, dynamics)
         contents = [
             ContentMeasure(s, part[s], whole[s], low[s], high[s])
             for s, service in enumerate(network.services)
             if service.substance
         ]
-        return cls(table, by_stage, low * (1.0 + margin), contents, is_absolute)
+        return cls(table, by_stage, low * (1.0 + margin), high, limited, contents, is_absolute)
 
     def rows(
         self, t: int, levels: Floats, end: Floats, response: Floats, furthest: Floats
     ) -> tuple[sparse.csr_array, Floats, Integers]:
         """Return rows of interval t, their limits, and which measures they are of: those that a step can come to.
 
-        low·level − δq ≤ q, −δx ≤ x and ±(φ + δφ) ≤ imbalance, with q, x and φ those of the episode.
+        low·level − δq ≤ q, −δx ≤ x and ±(φ + δφ) ≤ imbalance, with q, x and φ those of the episode. Above a band the
+        level is high/q, a convex function, which lies above its tangent where m = max(q, high)::
+
+            m²/high·level + δq ≤ 2 m − q.
 
         Args:
             t: the interval.
@@ -119,6 +126,14 @@ class Measures:
         services = len(self.low)
         table, limit, own = -self.by_stage @ response, self.by_stage @ end, np.zeros((len(self.table), services + 1))
         own[np.arange(services), np.arange(services)] = self.low[:, t]
+        last = len(table) - 2 * self.is_absolute
+        for row, s in zip(range(last - len(self.limited), last), self.limited, strict=True):
+            high, quantity = self.high[s, t], -limit[row]
+            if 0.0 < high < np.inf:
+                most = max(quantity, high)
+                limit[row], own[row, s] = 2.0 * most - quantity, most**2 / high
+            else:  # no end in this interval, or nothing at all, which is no matter of more or less
+                limit[row] = np.inf
         for content in self.contents:
             s = content.service
             table[s], limit[s], own[s, s] = content.row(t, levels[s], end, response)

@@ -73,7 +73,7 @@ def climb_window(
 
     def simulate(trial: WindowActions) -> WindowEpisode:
         outcome = future.carry_out(task, trial.actions)
-        levels = np.minimum(outcome.level, 1.0).T[None]
+        levels = outcome.level.T[None]
         bookings = np.zeros((1, len(outcome.amounts), future.horizon))
         bookings[0, :, task.intervals.start : task.intervals.stop] = outcome.amounts
         accounts = outcome.accounts[None]

@@ -79,10 +79,8 @@ TOLERANCE = 2e-4
 class WindowOutcome:
     """What the simulator makes of actions of some intervals."""
 
-    level: Annotated[
-        Floats,
-        "of services, more than 1 where there is too much, or of a content with room, shape (intervals, services)",
-    ]
+    level: Annotated[Floats, "of services, shape (intervals, services)"]
+    ratio: Annotated[Floats, "of what there is to the lower end, of a content 1 and what room is left, likewise"]
     bookings: Annotated[Floats, "on budgeted accounts, in parts of budgets, shape (intervals, budgets)"]
     amounts: Annotated[Floats, "on all accounts, not discounted, (accounts, intervals); empty if none counts"]
     accounts: Annotated[Floats, "their totals, discounted, shape (accounts,)"]
@@ -155,7 +153,7 @@ class Future:
         self._planned_arcs = np.arange(self._arcs) if mixtures is None else mixtures.arcs.ravel()
         contents = [service for service in network.services if service.substance]
         self._contents = np.array([network.services.index(service) for service in contents], dtype=np.intp)
-        bands = [[network.interval_means(end) for end in (service.low, service.high)] for service in contents]
+        bands = [[network.interval_means(end) for end in (service.low, service.high)] for service in network.services]
         self._bands = np.array(bands).reshape(-1, 2, network.episode.horizon).transpose(1, 2, 0)
         self._weight = service_weight
         controlled = ~admissible.by_schedule & (admissible.rate[0] < admissible.rate[1]).any(axis=0)
@@ -288,8 +286,8 @@ class Future:
         actions = normalised_actions(admissible, layout, variables, task.stock, intervals)
         promise, weight = self._promise(problem, plan, variables)
         outcome = self.carry_out(task, actions, weight)
-        level, bookings = outcome.level, outcome.bookings
-        error = np.where(weight > 0, np.clip(promise - level, -1.0, 1.0), 0.0)
+        bookings = outcome.bookings
+        error = np.where(weight > 0, np.clip(promise - outcome.ratio, -1.0, 1.0), 0.0)
         excess = np.zeros_like(bookings)
         if self._budgets:
             rows_of_totals, beside = self.booking_rows(problem, task)
@@ -300,7 +298,7 @@ class Future:
         return WindowTrial(
             actions,
             outcome.value,
-            np.minimum(level, 1.0).mean(axis=0),
+            outcome.level.mean(axis=0),
             Correction(error, excess, through, *self._factors(variables, intervals)),
             bookings,
             variables[:, layout.level : layout.imbalance],
@@ -317,9 +315,13 @@ class Future:
         low, flows = self.admissible.service_low[intervals.start : intervals.stop], flows_of_all[:, : self._arcs]
         masses = np.concatenate([stocks[1:], flows_of_all], axis=1)
         quantity = masses @ self._measure.T
-        level = np.divide(quantity, low, out=np.ones_like(low), where=low > 0)
+        ratio = np.divide(quantity, low, out=np.ones_like(low), where=low > 0)
         if len(self._contents):
-            level[:, self._contents] = self._content_levels(quantity, masses @ self._whole.T, intervals, most)
+            ratio[:, self._contents] = self._content_levels(quantity, masses @ self._whole.T, intervals, most)
+        level, high = np.minimum(ratio, 1.0), self._bands[1, intervals.start : intervals.stop]
+        is_over = quantity > high
+        is_over[:, self._contents] = False
+        np.divide(high, quantity, out=level, where=is_over)
         bookings, amounts = np.zeros((len(intervals), len(self._budgets))), np.zeros((0, len(intervals)))
         accounts = np.zeros(0)
         if self._ledger is not None:  # whose copies are the intervals here
@@ -333,16 +335,16 @@ class Future:
             amounts, period = self._ledger.sums(entries), slice(task.intervals.start, task.intervals.stop)
             accounts = (amounts * self._discount[:, period]).sum(axis=1)
             bookings = (amounts[self._budgets] * self._counts[:, period] / self.aims.sizes[:, None]).T
-        value = self._value(task, flows_of_all, stocks[-1], np.minimum(level, 1.0), accounts)
+        value = self._value(task, flows_of_all, stocks[-1], level, accounts)
         if len(task.charges):
             value -= float(task.charges @ bookings.sum(axis=0))
         stock = self.dynamics.rows.stocks(stocks[1:].T).T
-        return WindowOutcome(level, bookings, amounts, accounts, value, stock, flows)
+        return WindowOutcome(level, ratio, bookings, amounts, accounts, value, stock, flows)
 
     def _content_levels(self, part: Floats, whole: Floats, intervals: range, most: Floats | None) -> Floats:
         """Return the levels of contents, shape (intervals, contents), of masses, shape (intervals, services)."""
         part, whole = part[:, self._contents], whole[:, self._contents]
-        low, high = (ends[intervals.start : intervals.stop] for ends in self._bands)
+        low, high = (ends[intervals.start : intervals.stop, self._contents] for ends in self._bands)
         finite = np.isfinite(high)
         excess = np.maximum(low * whole - part, np.where(finite, part - np.where(finite, high, 0.0) * whole, -np.inf))
         # min(1, content/low, high/content) by what is too little, or too much
@@ -546,7 +548,7 @@ class WindowPlanner:
     def with_actions(self, plan: WindowPlan, actions: Sequence[Floats]) -> WindowPlan:
         """Return a plan with other actions, and what comes of them; see ``better_of``."""
         outcomes = [future.carry_out(plan.task, course) for future, course in zip(self.futures, actions, strict=True)]
-        levels = np.mean([np.minimum(outcome.level, 1.0) for outcome in outcomes], axis=0)
+        levels = np.mean([outcome.level for outcome in outcomes], axis=0)
         bookings = np.mean([outcome.bookings for outcome in outcomes], axis=0)
         value = float(np.mean([outcome.value for outcome in outcomes]))
         figures = {"levels": levels, "level": levels.mean(axis=0), "bookings": bookings, "value": value}
