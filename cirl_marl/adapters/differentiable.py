@@ -82,8 +82,8 @@ class DifferentiableEnv:
             raise ControlError("the environment has no state yet: call reset() first")
         shape = (len(self.env.actuators.control_rows), self.env.num_envs)
         if not isinstance(actions, Tensor) or actions.shape != shape:
-            what = f"shape {tuple(actions.shape)}" if isinstance(actions, Tensor) else type(actions).__name__
-            raise ControlError(f"actions are a tensor of shape {shape}, got {what}")
+            form = f"shape {tuple(actions.shape)}" if isinstance(actions, Tensor) else type(actions).__name__
+            raise ControlError(f"actions are a tensor of shape {shape}, got {form}")
         outputs: Any = _Interval.apply(self._derivatives, self._stock, actions, self.disturbances)  # type: ignore[no-untyped-call]
         self._stock, circularity, levels, observation, self.bookings = outputs
         return observation, circularity, levels

@@ -101,8 +101,8 @@ def _proof(controller: Controller, table: Schedule) -> str:
         limit -= solution.service_weight * float(run.episode_service[0])
         limit, demand = limit * network.objective.circularity_scale, "this service"
         if gap(limit, aims.value(run)) > LOOSE:
-            served = np.maximum(run.episode_levels[0] - TOLERANCE, 0.0)
-            at_service = bound(network, solution.initial, min_service=served, agents=solution.agents or None)
+            levels = np.maximum(run.episode_levels[0] - TOLERANCE, 0.0)
+            at_service = bound(network, solution.initial, min_service=levels, agents=solution.agents or None)
             limit = min(limit, at_service.objective)
     elif solution.min_service is not None:
         demand = f"a service of at least {levels_text(network, solution.min_service)}"

@@ -258,10 +258,10 @@ def _corrected_step(
             break
         if corrected is program and program.promise(values) <= least:
             return None
-        candidate, trial, gain = _tried(plan, values[program.columns.action], trials, price, value)
+        candidate, trial, gain = _trial_of(plan, values[program.columns.action], trials, price, value)
         if gain <= 0 and values[program.columns.action][program.idle].any():  # flows that were cut may not be beyond
             moves = np.where(program.idle, 0.0, values[program.columns.action])
-            candidate, trial, gain = _tried(plan, moves, trials, price, value)
+            candidate, trial, gain = _trial_of(plan, moves, trials, price, value)
         if gain > best.gain:
             best = _Step(candidate, trial, gain)
         elif best.gain > 0:
@@ -272,7 +272,7 @@ def _corrected_step(
     return best
 
 
-def _tried(plan: P, moves: Floats, trials: Trials, price: Floats, value: float) -> tuple[P, Any, float]:
+def _trial_of(plan: P, moves: Floats, trials: Trials, price: Floats, value: float) -> tuple[P, Any, float]:
     """Return a plan with actions that have moved, its episode, and the gain."""
     candidate: P = replace(plan, actions=np.clip(plan.actions + moves, -1.0, 1.0))  # type: ignore[type-var]
     trial = trials.simulate(candidate)

@@ -54,7 +54,7 @@ class Measures:
     by_stage: Annotated[Floats, "of rows of Jacobians, shape (measures, rows)"]
     low: Annotated[Floats, "with how much of a service its band begins, shape (services, steps)"]
     high: Annotated[Floats, "with how much its band ends, infinite where it does not, likewise"]
-    limited: Annotated[Integers, "services that are read once more, whose band ends"]
+    ends: Annotated[Integers, "services that are read once more, whose band ends"]
     contents: Annotated[list[ContentMeasure], "services of contents, of which ``table`` reads masses alone"]
     is_absolute: Annotated[bool, "whether |φ| counts"]
 
@@ -85,8 +85,8 @@ class Measures:
             for ends in ([s.low for s in network.services], [s.high for s in network.services])
         )
         has_end = np.isfinite(high).any(axis=1) & np.array([not s.substance for s in network.services], dtype=bool)
-        limited = np.flatnonzero(has_end)
-        rows = [*services, *columns[donors[donors < stores]], *(-services[s] for s in limited)]
+        ends = np.flatnonzero(has_end)
+        rows = [*services, *columns[donors[donors < stores]], *(-services[s] for s in ends)]
         if is_absolute:
             rows += [sign * np.append(np.zeros(stores), -network.circularity_weights[1]) for sign in (-1.0, 1.0)]
         table = np.array(rows).reshape(-1, len(columns))
@@ -101,7 +101,7 @@ class Measures:
             for s, service in enumerate(network.services)
             if service.substance
         ]
-        return cls(table, by_stage, low * (1.0 + margin), high, limited, contents, is_absolute)
+        return cls(table, by_stage, low * (1.0 + margin), high, ends, contents, is_absolute)
 
     def rows(
         self, t: int, levels: Floats, end: Floats, response: Floats, furthest: Floats
@@ -127,7 +127,7 @@ class Measures:
         table, limit, own = -self.by_stage @ response, self.by_stage @ end, np.zeros((len(self.table), services + 1))
         own[np.arange(services), np.arange(services)] = self.low[:, t]
         last = len(table) - 2 * self.is_absolute
-        for row, s in zip(range(last - len(self.limited), last), self.limited, strict=True):
+        for row, s in zip(range(last - len(self.ends), last), self.ends, strict=True):
             high, quantity = self.high[s, t], -limit[row]
             if 0.0 < high < np.inf:
                 most = max(quantity, high)

@@ -227,12 +227,12 @@ def _check_training(row: ResultRow, controller: Controller) -> None:
     run, is_of_suite = getattr(controller, "run", None), row.algorithm in algorithms()
     if run is None and not is_of_suite:
         return
-    made = {"seed": None, "steps": 0} if run is None else {"seed": run.config.seed, "steps": run.config.steps}
+    actual = {"seed": None, "steps": 0} if run is None else {"seed": run.config.seed, "steps": run.config.steps}
     if is_of_suite:
-        made |= {"algorithm": "" if run is None else run.config.recipe.name}
-    for name, value in made.items():
-        if (stated := getattr(row, name)) != value:
-            raise RunError(f"{name} is {stated}, but that of the policies {value}")
+        actual |= {"algorithm": "" if run is None else run.config.recipe.name}
+    for name, value in actual.items():
+        if (claim := getattr(row, name)) != value:
+            raise RunError(f"{name} is {claim}, but that of the policies {value}")
     if is_of_suite and row.steps != (budget := load_algorithm(row.algorithm).steps(load_task(row.task))):
         raise RunError(f"steps are {row.steps:,}, where '{row.algorithm}' has {budget:,}: give it another name")
 

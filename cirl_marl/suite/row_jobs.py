@@ -163,9 +163,9 @@ def benchmark(
     Raises:
         CirlError: for an unknown task or algorithm, before anything is done; it names the nearest.
     """
-    for name, given in (("task", names), ("algorithm", algorithms), ("seed", seeds)):
-        if repeated := [value for value, count in Counter(given or ()).items() if count > 1]:
-            raise CirlError(f"{name} {repeated[0]} is given more than once")
+    for name, options in (("task", names), ("algorithm", algorithms), ("seed", seeds)):
+        if doubles := [value for value, count in Counter(options or ()).items() if count > 1]:
+            raise CirlError(f"{name} {doubles[0]} is given more than once")
     selection, folder = [load_task(name) for name in (tasks() if names is None else names)], Path(out)
     about: dict[str, Any] = {"version": metadata.version("cirl-marl"), "contributor": contributor}
     jobs = []
