@@ -25,6 +25,7 @@ from cirl_marl import (
     Role,
     Series,
     Service,
+    Substance,
     load_network,
     parallel_env,
     simulate,
@@ -196,6 +197,26 @@ def test_uncertain_capacity_rates_are_drawn() -> None:
     factor = float(env.physical.factors[0, 0])
     assert 0.5 < factor < 0.99
     assert run.flow[0, network.arc_index["run_old"]] == pytest.approx(4.0 * factor)
+
+
+def test_all_substances_are_limited_by_the_same_draw() -> None:
+    """What is no substance and each substance, of a source that gives what is stated: as in the network of the draw."""
+    stated = {"sulphur": Series(times=(0.0, float(YEARS)), values=(0.1, 0.3), interpolation="linear")}
+    plain, substances = power(), (Substance(id="sulphur"),)
+    nodes = tuple(replace(node, content=stated) if node.id == "fuel" else node for node in plain.nodes)
+    spread = Spread(low=0.5, high=1.0, distribution="uniform")
+    path = "arcs.run_old.capacity_rate"
+    network = replace(plain, nodes=nodes, substances=substances, uncertain={path: spread})
+    env = MultiAgentVectorEnv(network, num_envs=2, uncertain=True)
+    env.reset(seed=3)
+    lone = MultiAgentVectorEnv(env.certain_network(1), num_envs=1)
+    lone.reset(seed=4)
+    actions = len(env.actuators.control_rows)
+    for _ in range(6):
+        drawn, certain = (each.advance(np.ones((actions, each.num_envs))) for each in (env, lone))
+        np.testing.assert_allclose(drawn.flow[:, 1], certain.flow[:, 0], rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(env.physical.substances[:, 1], lone.physical.substances[:, 0], rtol=1e-9, atol=1e-9)
+    assert (lone.physical.substances > 0).any()
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,8 @@ class Capacities:
         table = np.array(rates).reshape(len(arcs), network.episode.horizon)
         self._rates = table[:, :1] if constant else table
         numbers = numbers_of(ranges, "arcs", "capacity_rate")
-        self._factors = RowFactors({n: numbers[arc.id] for n, arc in enumerate(arcs) if arc.id in numbers})
+        originals = [network.original(arc.id) for arc in arcs]  # a substance is limited as all of it is
+        self._factors = RowFactors({n: numbers[id_] for n, id_ in enumerate(originals) if id_ in numbers})
 
     def __bool__(self) -> bool:
         """Whether there are any."""
