@@ -142,6 +142,7 @@ def test_infos_hold_what_each_interval_and_the_episode_book() -> None:
     totals = final["episode_accounts"]
     assert totals["emissions"].shape == totals["cost"].shape == (2,)
     assert (totals["emissions"] > 0).all() and (sums > 0).all()
+    assert not totals["cost"].flags.writeable, "they are the simulator's own"
     assert not any(name in final for name in ("episode_emissions", "episode_cost")), "costs of safety have such names"
 
 

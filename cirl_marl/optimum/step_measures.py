@@ -84,8 +84,8 @@ class Measures:
             )
             for ends in ([s.low for s in network.services], [s.high for s in network.services])
         )
-        has_end = np.isfinite(high).any(axis=1) & np.array([not s.substance for s in network.services], dtype=bool)
-        ends = np.flatnonzero(has_end)
+        is_plain = np.array([not service.substance for service in network.services], dtype=bool)
+        ends = np.flatnonzero(np.isfinite(high).all(axis=1) & is_plain)
         rows = [*services, *columns[donors[donors < stores]], *(-services[s] for s in ends)]
         if is_absolute:
             rows += [sign * np.append(np.zeros(stores), -network.circularity_weights[1]) for sign in (-1.0, 1.0)]
@@ -129,11 +129,8 @@ class Measures:
         last = len(table) - 2 * self.is_absolute
         for row, s in zip(range(last - len(self.ends), last), self.ends, strict=True):
             high, quantity = self.high[s, t], -limit[row]
-            if 0.0 < high < np.inf:
-                most = max(quantity, high)
-                limit[row], own[row, s] = 2.0 * most - quantity, most**2 / high
-            else:  # no end in this interval, or nothing at all, which is no matter of more or less
-                limit[row] = np.inf
+            most = max(quantity, high)
+            limit[row], own[row, s] = 2.0 * most - quantity, most**2 / high
         for content in self.contents:
             s = content.service
             table[s], limit[s], own[s, s] = content.row(t, levels[s], end, response)
