@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from cirl_marl.optimum.bounds import Bound, bound, gap
 from cirl_marl.optimum.open_loop import Optimum
 from cirl_marl.optimum.options import lack_texts, levels_text
 from cirl_marl.optimum.registry import CONTROLLERS, named_controller
+from cirl_marl.optimum.solver import SolverFailure
 
 LOOSE, TOLERANCE = 0.05, 1e-6
 """Gap beyond which a bound on λ̄ and service together says little of λ̄, and level within which a solver is exact."""
@@ -102,8 +104,9 @@ def _proof(controller: Controller, table: Schedule) -> str:
         limit, demand = limit * network.objective.circularity_scale, "this service"
         if gap(limit, aims.value(run)) > LOOSE:
             levels = np.maximum(run.episode_levels[0] - TOLERANCE, 0.0)
-            at_service = bound(network, solution.initial, min_service=levels, agents=solution.agents or None)
-            limit = min(limit, at_service.objective)
+            with suppress(SolverFailure):  # the first bound holds as well
+                at_service = bound(network, solution.initial, min_service=levels, agents=solution.agents or None)
+                limit = min(limit, at_service.objective)
     elif solution.min_service is not None:
         demand = f"a service of at least {levels_text(network, solution.min_service)}"
     unit = "λ̄/scale" if solution.service_weight is not None else aims.unit(network)
