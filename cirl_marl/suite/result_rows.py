@@ -214,8 +214,8 @@ def _verify(path: Path, row: ResultRow) -> None:
             raise RunError(f"{place}: {weights} has another SHA-256, {actual}, than the row, {row.sha256}")
     with _error_place(place):
         controller, options = controller_of(task, row.algorithm, weights)
-        _check_training(row, controller)
         figures = columns_of(task.measure(controller, episodes=row.episodes, **options))
+        _check_training(row, controller)
     for name, now in figures.items():
         if not is_reproduced(row, name, now):
             digits, rerun = (FORMS[name].format(figure) for figure in (getattr(row, name), now))
