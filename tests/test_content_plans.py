@@ -14,7 +14,7 @@ from conftest import random_network, with_substances
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
-from small_networks import mill
+from small_networks import constant, mill
 from test_substances import COPPER, EXAMPLE, TIN, sorter, substances_networks
 
 from cirl_marl import (
@@ -417,6 +417,8 @@ def test_margins_of_contents_are_stricter() -> None:
 def test_levels_of_contents_in_windows_are_those_of_the_simulator() -> None:
     """Whatever actions do, and of both ends of a band; nothing at all is as good as what is wanted."""
     network = sorter(low=0.01, high=0.02)
+    products = replace(network.services[0], high=1.1 * constant(network.services[0].low))
+    network = replace(network, services=(products, *network.services[1:]))
     future = Future(Admissible.of(network), 2, None)
     start = by_stage(network, future.dynamics.rows, network.initial[0])
     task = WindowTask(start, range(6), None, None, np.zeros(0), None)
@@ -430,9 +432,10 @@ def test_levels_of_contents_in_windows_are_those_of_the_simulator() -> None:
         sums.append(env.physical.service[:, 0])
     levels = np.diff(sums, axis=0, prepend=0.0)
     outcome = future.carry_out(task, actions)
-    np.testing.assert_allclose(np.minimum(outcome.level, 1.0), levels, rtol=1e-9)
+    np.testing.assert_allclose(outcome.level, levels, rtol=1e-9)
+    assert ((outcome.ratio[:, 0] > 1.1) & (levels[:, 0] < 1.0)).any(), "too much of a product"
     assert outcome.level[0, 1] == 1.0 and len(np.unique(levels[:, 1])) >= 3
-    assert (future.carry_out(task, actions, np.full((6, 2), 2.0)).level[:, 1] > 1.0).any()
+    assert (future.carry_out(task, actions, np.full((6, 2), 2.0)).ratio[:, 1] > 1.0).any()
 
 
 def test_windows_leave_what_comes_later_as_it_was() -> None:
