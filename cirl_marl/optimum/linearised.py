@@ -106,7 +106,7 @@ class StepProgram:
     columns: Annotated[StepColumns, "where its variables are"]
     scale: Annotated[Floats, "measure of each variable, shape (variables,)"]
     origin: Annotated[Floats, "its variables if nothing changes, likewise"]
-    idle: Annotated[NDArray[np.bool_], "actions that change nothing to first order, shape (steps, entries)"]
+    idle: Annotated[NDArray[np.bool_], "actions that move nothing to first order, shape (steps, entries)"]
     place: Annotated[Integers, "interval and measure of each of the first rows of G, shape (rows, 2)"]
     measures: Annotated[Measures, "what these read"]
     aims: Annotated[Aims, "whose budgets the last rows of G keep"]
@@ -207,7 +207,6 @@ def step_program(
     measure_rows, part_rows, places = _Rows(count), _Rows(count), list[Integers]()
     before = np.empty((slopes.end.shape[1], 0))
     is_idle = np.ones(count, dtype=bool)
-    is_idle[effort_actions] = False
     for t, response in enumerate(slopes.responses()):
         past, end = moves[: t + 1].ravel(), slopes.end[t]
         is_idle[past] &= ~response.any(axis=0)
