@@ -251,6 +251,7 @@ def test_the_best_of_a_round_counts_and_what_it_lacks_is_asked_for(monkeypatch: 
     class Step(SimpleNamespace):
         problem, scale = None, None
         columns = SimpleNamespace(action=np.arange(found.actions.size).reshape(found.actions.shape))
+        idle = np.zeros(found.actions.shape, dtype=bool)
 
         def promise(self, values: Floats) -> float:
             return 1.0
