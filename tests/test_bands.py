@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cirl_marl import MPC, Arc, Control, ControlKind, Episode, Law, MultiAgentVectorEnv, Network, Node, Role, Service
 from cirl_marl.controllers.rollout import Rollout, episode_start
+from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.plans import plan as tell_plan
 from cirl_marl.network.elements import Account
 from cirl_marl.optimum import bound, gap, improve_plan, simulate_plan
@@ -21,7 +22,7 @@ from cirl_marl.optimum.cross_entropy import search
 Floats = NDArray[np.float64]
 
 
-def maker(low: float, high: float, ore: float = 0.3, horizon: int = 4) -> Network:
+def maker(low: float, high: float, ore: float = 0.3) -> Network:
     """Return a use whose inflow is to lie in a band: what is wasted, an agent's share, comes back otherwise."""
     share = Control(kind=ControlKind.SHARE, low=0.1, neutral=0.5, high=0.8)
     return Network(
@@ -39,7 +40,7 @@ def maker(low: float, high: float, ore: float = 0.3, horizon: int = 4) -> Networ
             Arc(id="back", donor="use", recipient="market", rate=1.0),
         ),
         services=(Service(id="product", provider="made", quantity="flow", low=low, high=high),),
-        episode=Episode(control_interval=1.0, horizon=horizon),
+        episode=Episode(control_interval=1.0, horizon=4),
     )
 
 
@@ -148,6 +149,12 @@ def test_budgets_of_nothing_are_exceeded_by_amounts() -> None:
     env.reset(seed=0)
     controller.start(env, seed=0)
     assert "this one has 2.4 EUR_2020 of cost" in controller.note
+
+
+def test_an_unknown_aim_is_named_before_anything_else() -> None:
+    """Not that a service is to be demanded beside it."""
+    with pytest.raises(CirlError, match=r"unknown account or service 'prodct'.*Did you mean 'product'"):
+        tell_plan(maker(0.25, 0.4), "optimum", aim="prodct")
 
 
 def test_a_search_has_as_many_knots_as_decisions_at_most() -> None:

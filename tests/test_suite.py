@@ -336,7 +336,7 @@ BAD: dict[str, tuple[dict[str, str], str]] = {
     "other steps": ({"steps": "7"}, r"row '.*/ppo/401': steps is 7, but that of the policies 10240"),
     "another algorithm": ({"algorithm": "sac"}, r"row '.*/sac/401': algorithm is sac, but that of the policies ppo"),
     "out of the folder": ({"weights": "../a.safetensors"}, r"row 2: weights '\.\./a\.safetensors' are not below the"),
-    "anywhere": ({"weights": "/tmp/a.safetensors"}, "row 2: weights '/tmp/a.safetensors' are not below the folder"),
+    "anywhere": ({"weights": "/any/a.safetensors"}, "row 2: weights '/any/a.safetensors' are not below the folder"),
     "nobody": ({"algorithm": " "}, "row 2: algorithm is empty; name one of the suite, or your own"),
     "a seed of nobody": ({"algorithm": "neutral"}, "row 2: seed 401: 'neutral' is not trained; leave it empty"),
     "only a variant": ({"variant": "1"}, "has no rows but those of held-out variants to rerun"),

@@ -258,10 +258,10 @@ def _corrected_step(
             break
         if corrected is program and program.promise(values) <= least:
             return None
-        candidate, trial, gain = _trial_of(plan, values[program.columns.action], trials, price, value)
-        if gain <= 0 and values[program.columns.action][program.idle].any():  # flows that were cut may not be beyond
-            moves = np.where(program.idle, 0.0, values[program.columns.action])
-            candidate, trial, gain = _trial_of(plan, moves, trials, price, value)
+        moves = values[program.columns.action]
+        candidate, trial, gain = _trial_of(plan, moves, trials, price, value)
+        if gain <= 0 and moves[program.idle].any():  # flows that were cut may not be beyond
+            candidate, trial, gain = _trial_of(plan, np.where(program.idle, 0.0, moves), trials, price, value)
         if gain > best.gain:
             best = _Step(candidate, trial, gain)
         elif best.gain > 0:
