@@ -10,10 +10,13 @@ from importlib import import_module
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, TypeVar
+from unicodedata import category
 
 T = TypeVar("T")
 LONGEST_LINE = 1200
 """Characters of a line of a message; of a longer one, which repeats what is in a file, the middle is left out."""
+CONTROL = ("Cc", "Cf")
+"""Unicode's categories of what is no character to be read: control characters, and those that turn a text round."""
 MOST_LINES = 10
 """Most faults of one kind that a message lists."""
 
@@ -22,8 +25,19 @@ class CirlError(ValueError):
     """Base of every error that this library raises about its input."""
 
     def __init__(self, message: object = "") -> None:
-        """Take a message, lines of which that are too long to be read are shortened."""
-        super().__init__("\n".join(map(_shorten, str(message).split("\n"))))
+        """Take a message: what a terminal would act on is written out, and lines too long to be read are shortened."""
+        super().__init__("\n".join(_shorten(_printable(line)) for line in str(message).split("\n")))
+
+
+def _printable(line: str) -> str:
+    r"""Return a line with control characters as Python writes them.
+
+    >>> _printable("kt\x1b[31m")
+    'kt\\x1b[31m'
+    """
+    if line.isprintable():
+        return line
+    return "".join(repr(character)[1:-1] if category(character) in CONTROL else character for character in line)
 
 
 def _shorten(line: str) -> str:

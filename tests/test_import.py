@@ -347,6 +347,8 @@ def two_regions(missing: int) -> list[list[object]]:
             "flows.csv, line 4: unit 't/year', but 'kt/year' in flows.csv, line 2; give all in one",
         ),
         (bad(unit=""), {}, "flows.csv, line 4: states no unit, as others do; write 'kt/year'"),
+        ([[*row[:-1], "kg/m"] for row in cycle()], {}, "flows.csv, line 2: unit 'kg/m' is inconsistent"),
+        (bad(value="\x1b[31m2"), {}, r"flows.csv, line 4, column 'value': '\x1b[31m2' is no number"),
         (bad(value="n/a"), {}, "flows.csv, line 4, column 'value': 'n/a' is no number"),
         (bad(value=""), {}, "flows.csv, line 4, column 'value': '' is no number"),
         (bad(year="2000.5"), {}, "flows.csv, line 4: '2000.5' is no whole year"),
@@ -400,7 +402,7 @@ def test_bad_files_are_refused(tmp_path: Path) -> None:
         ({"sheet": "Flws"}, "unknown sheet 'Flws'. Did you mean 'Flows'"),
         ({}, "is a matrix of processes, as it has no columns 'source' and 'target'; of which year? Give --year"),
         ({"year": 2001}, "states no unit; give one with --unit, such as kt/year"),
-        ({"year": 2001, "unit": "kg/m"}, "unit 'kg/m' is inconsistent"),
+        ({"year": 2001, "unit": "kg/m"}, "--unit kg/m: unit 'kg/m' is inconsistent"),
     ):
         with pytest.raises(CirlError) as refused:
             read_flows(tmp_path / "book.xlsx", **options)

@@ -106,7 +106,7 @@ def test_copies_share_their_levers() -> None:
     [
         ({"all": ["paper_last"]}, r"groups: 'all': unknown agent 'paper_last'. Did you mean 'paper_lost'\?"),
         ({"a": ["paper_lost"], "b": ["paper_lost"]}, "'paper_lost' is in 'a' and in 'b'; a lever has it alone"),
-        ({"a": [f"{name}_lost" for name in STOCKS]}, "has 1 levers; two or more can be told apart"),
+        ({"a": [f"{name}_lost" for name in STOCKS]}, "has one lever; two or more can be told apart"),
     ],
 )
 def test_mistakes(groups: dict[str, list[str]], message: str) -> None:

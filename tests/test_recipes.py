@@ -376,6 +376,8 @@ def test_whole_episodes_need_a_single_environment(tmp_path: Path) -> None:
         ([True], ".0"),
         ([1.5], ".0"),
         ({"pi": [8], "vf": [8, -1]}, ".vf.1"),
+        ("8", ""),
+        (["8"], ".0"),
     ],
 )
 def test_layers_have_units(layers: Any, place: str) -> None:

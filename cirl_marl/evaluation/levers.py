@@ -287,5 +287,6 @@ def _agents_by_lever(network: Network, groups: Mapping[str, Sequence[str]]) -> d
         name = title if agent == original and titles[title] == 1 else original.replace("_", " ")
         by_lever.setdefault(together.get(original, name), []).append(agent)
     if len(by_lever) < 2:
-        raise CirlError(f"network '{network.name}': it has {len(by_lever)} levers; two or more can be told apart")
+        count = "one lever" if by_lever else "no levers"
+        raise CirlError(f"network '{network.name}': it has {count}; two or more can be told apart")
     return by_lever

@@ -428,7 +428,7 @@ def _unit(path: Path, units: Mapping[str, str], default_unit: str | None) -> str
         factor(unit, "kg")
         return f"{unit}/year"  # yearly masses are flows
     except CirlError as error:
-        raise CirlError(f"{path}: {error}") from error
+        raise CirlError(f"{units.get(unit, f'--unit {default_unit}')}: {error}") from error
 
 
 def _check_years(table: FlowTable) -> None:

@@ -128,7 +128,8 @@ def parameter_mistakes(name: str, parameters: Mapping[str, Any]) -> Iterator[str
                 yield f"{place}: {name} needs {_requirement(signature[key])}, got {value!r}"
         elif key == "policy_kwargs" and value:
             for part, width in _leaves(f"{place}.net_arch", value.get("net_arch")):
-                if isinstance(width, bool | float) or (isinstance(width, int) and not 1 <= width <= WIDEST):
+                is_width = isinstance(width, int) and not isinstance(width, bool) and 1 <= width <= WIDEST
+                if width is not None and not is_width:
                     yield f"{part}: a layer has 1 to {WIDEST:,} units, got {width!r}"
             for part, kind in value.items():
                 if isinstance(kind, str) and part.endswith(("_class", "_fn")):
