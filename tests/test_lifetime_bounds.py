@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import pairwise
 from math import comb
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.linalg import expm
 from scipy.special import gammainc, gammaincc
 from scipy.stats import poisson
@@ -34,8 +36,9 @@ from cirl_marl.controllers import Constant, Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.network.elements import Lifetime
 from cirl_marl.network.lifetimes import Chain, chain_of
-from cirl_marl.optimum import bound, envelope, improve_plan, simulate_plan, vintages
+from cirl_marl.optimum import bound, envelope, histories, improve_plan, simulate_plan, vintages
 from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.histories import History
 from cirl_marl.optimum.kernels import Kernel
 from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.mpc import MPC
@@ -47,6 +50,12 @@ from cirl_marl.optimum.vintages import Lifetimes
 
 Floats = NDArray[np.floating]
 FINE = 300
+
+
+def rows_of(lifetimes: Lifetimes, layout: Layout, start: Any, intervals: range) -> tuple[Any, Floats]:
+    """Return the rows G v ≤ g of all lifetimes as one matrix, and g."""
+    blocks, limits = lifetimes.rows(layout, start, intervals)
+    return sparse.vstack([b.matrix if isinstance(b, History) else b for b in blocks], format="csr"), limits
 
 
 def weighted(values: Floats, degree: int) -> Floats:
@@ -144,7 +153,7 @@ def test_what_is_new_counts_in_each_row_as_if_it_had_been_there(mean: float) -> 
     start = by_stage(network, lifetimes.state_layout, network.initial[1])
     more = start.copy()
     more[whole.rows[0]] += whole.chain.inflow_shares / whole.chain.inflow_shares.sum()
-    matrix, to = lifetimes.rows(layout, start, range(5))
+    matrix, to = rows_of(lifetimes, layout, start, range(5))
     added = lifetimes.rows(layout, more, range(5))[1] - to
     new = lifetimes.of_new(whole, layout)
     assert new.shape == (5, matrix.shape[0])
@@ -165,7 +174,7 @@ def test_rows_do_not_depend_on_how_long_lives_turn_out(mean: float) -> None:
         network = town(lifetime, INFLOW[:5], initial=30.0, stretch=stretch)
         lifetimes = Programs(Admissible.of(network), 1, None, layout=layout).admissible.lifetimes
         start = by_stage(network, lifetimes.state_layout, network.initial[1])
-        shapes.add(lifetimes.rows(layout, start, range(2))[0].shape)
+        shapes.add(rows_of(lifetimes, layout, start, range(2))[0].shape)
     assert len(shapes) == 1
 
 
@@ -174,6 +183,55 @@ def _families(count: int, layout: Layout, steps: int) -> list[NDArray[np.intp]]:
     size = steps * len(layout.moments)
     ends = [0, size, 2 * size, *((2 * size + steps * layout.pieces, count) if count > 2 * size else ())]
     return [np.arange(a, b).reshape(steps, -1) for a, b in pairwise(ends)]
+
+
+@pytest.mark.sample(2)
+@pytest.mark.parametrize("pieces", [1, 4])
+@pytest.mark.parametrize("stretch", [1.0, Series(times=(0.0, 9.0), values=(0.8, 1.4))])
+@pytest.mark.parametrize("lifetime", [LIVES[0], LIVES[2], Lifetime(mean=0.6, deviation=0.3, distribution="weibull")])
+def test_short_rows_say_the_same(
+    lifetime: Lifetime, stretch: float | Series, pieces: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of whatever enters, with states that stay in their boxes; and nothing of rows of another program."""
+    monkeypatch.setattr(histories, "MANY_ENTRIES", 0)
+    monkeypatch.setattr(histories, "SHORTER", np.inf)
+    years, rng = 9, np.random.default_rng(pieces)
+    network = town(lifetime, INFLOW[:years], initial=30.0, stretch=stretch)
+    programs = Programs(Admissible.of(network), 2, None)
+    layout = Layout(programs.layout.network, pieces, 2, np.empty(0, dtype=int), np.empty(0, dtype=int), coarse=True)
+    programs = Programs(Admissible.of(network), 2, None, layout=layout)
+    start = by_stage(network, programs.admissible.lifetimes.state_layout, network.initial[1])
+    problem = programs.program(start)
+    ((first, history),) = problem.histories
+    rows = slice(first, first + len(history.interval))
+    assert history.is_in(problem.under, rows) and not history.is_in(2 * problem.under, rows)
+    short = history.short_form(problem.high, years)
+    assert short is not None
+    for share in (rng.random(problem.high.shape), np.ones(problem.high.shape), rng.integers(2, size=len(problem.high))):
+        variables = share * problem.high
+        moments = short.shares @ variables
+        # states of one year after the other, as each follows from the one before
+        unknown, states = short.motion[:, len(moments) :], short.motion[:, : len(moments)] @ moments
+        values = np.append(moments, sparse.linalg.spsolve(sparse.csc_array(-unknown), states))
+        assert (values >= short.low - 1e-9).all() and (values <= short.high + 1e-9).all()
+        expected, size = history.matrix @ variables, abs(history.matrix).max(axis=1).toarray().ravel()
+        error = history.beside @ variables + short.rows @ values - expected
+        assert (np.abs(error) <= 1e-6 * size * problem.high.max()).all()
+
+
+@pytest.mark.sample(2)
+@pytest.mark.parametrize("seed", [11, 12, 13, 14])
+def test_short_rows_prove_what_long_ones_prove(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The certificate is one of the program as it is, whichever way it was solved; what is left out costs little."""
+    network = yearly_network(seed, replace(LIFETIMES, years=(8, 12), regions=(1, 1), products=(1, 3)))
+    expected = bound(network, min_service=0.9)
+    monkeypatch.setattr(histories, "MANY_ENTRIES", 0)
+    monkeypatch.setattr(histories, "SHORTER", np.inf)
+    found = bound(network, min_service=0.9)
+    assert expected.problem.histories and found.basis is None
+    assert found.verify().bound == found.objective
+    assert found.objective == pytest.approx(expected.objective, rel=1e-5)
+    assert found.certificate.under.shape == expected.certificate.under.shape
 
 
 @pytest.mark.sample(1)
@@ -188,7 +246,7 @@ def test_rows_and_boxes_hold_in_an_episode(lifetime: Lifetime, stretch: float | 
     layout = programs.layout.with_constant_parts(np.empty(0, dtype=np.intp), lifetimes.exit_arcs)
     start = by_stage(network, lifetimes.state_layout, network.initial[1])
     high = programs.program(start).high.reshape(years, -1)
-    matrix, to = lifetimes.rows(layout, start, range(years))
+    matrix, to = rows_of(lifetimes, layout, start, range(years))
     steps = layout.pieces * FINE
     short = network.with_options(episode={"control_interval": 1.0 / steps, "horizon": years * steps})
     run = rollout(MultiAgentVectorEnv(short, num_envs=1), Neutral())
@@ -240,7 +298,7 @@ def test_rows_hold_however_a_lifetime_is_stretched(lifetime: Lifetime, style: st
             values[year, steady] = least_outflow(whole.chain, turnover, whole.masses(starts[-1]), inflow[year])
             values[year, layout.end + network.node_index["use"]] = env.rows.stocks(env.physical.stock)[1, 0]
         for first in (0, 5):
-            matrix, to = lifetimes.rows(layout, starts[first], range(first, years))
+            matrix, to = rows_of(lifetimes, layout, starts[first], range(first, years))
             assert (matrix @ values[first:].ravel() <= to + 1e-9 * to.max()).all()
         stretches = lifetimes.planned_stretches(layout, values, starts[0], range(years))["use"]
         np.testing.assert_allclose(stretches, 0.8 + 0.5 * (actions + 1) / 2, rtol=1e-6)
@@ -376,7 +434,7 @@ def test_constant_parts_of_lifetimes_are_nearly_all_that_leaves(lifetime: Lifeti
     layout = Programs(Admissible.of(network), 2, None).layout
     layout = layout.with_constant_parts(np.empty(0, dtype=np.intp), lifetimes.exit_arcs)
     start = by_stage(network, lifetimes.state_layout, network.initial[1])
-    matrix, to = lifetimes.rows(layout, start, range(years))
+    matrix, to = rows_of(lifetimes, layout, start, range(years))
     whole, values = lifetimes.whole[0], np.zeros((years, layout.size))
     values[:, layout.flow + whole.inflow_arcs[0]] = 10.0
     rows = matrix.tocsc()[:, layout.size * np.arange(years) + layout.steady_column(whole.exit_arc)].nonzero()[0]

@@ -39,6 +39,7 @@ from cirl_marl.optimum.content_ranges import check_contents
 from cirl_marl.optimum.decay import decay_rows
 from cirl_marl.optimum.effort import charged_controls, effort_rows, largest_distances
 from cirl_marl.optimum.excess import excess_rows
+from cirl_marl.optimum.histories import History
 from cirl_marl.optimum.matrices import BEFORE, NOW, ChainedRows, IntervalCache, Layout, ProgramRows, RowParts
 from cirl_marl.optimum.mixtures import content_rows, mixture_rows
 from cirl_marl.optimum.quasi_steady import end_laws, has_fast_stocks, quasi_steady_rows
@@ -77,6 +78,7 @@ class Program(LinearProgram):
     layout: Annotated[Layout, "what v is"]
     constant: Annotated[float, "what no plan changes; the objective to maximise is −cᵀv + ``constant``"]
     system: Annotated[ComparisonSystem, "which bounds stocks; other programs of the network may have it too"]
+    histories: Annotated[tuple[tuple[int, History], ...], "rows of G over all that entered, and the first of them"]
 
     def interval_of_rows(self, matrix: Any) -> Integers:
         """Return the last interval whose variables each row of A or G is about, shape (rows,)."""
@@ -250,8 +252,12 @@ class Programs:
         excess_rows(lifetimes, self._ledger, initial, high.reshape(steps, -1), rows)
         from_start = rows.matrices()[0]
         from_start.eliminate_zeros()
-        lifetime_rows, lifetime_limits = lifetimes.rows(layout, initial, intervals)
-        blocks, limits = [under, from_start, lifetime_rows], [under_to, rows.limits(), lifetime_limits]
+        of_lifetimes, lifetime_limits = lifetimes.rows(layout, initial, intervals)
+        blocks, limits, histories = [under, from_start], [under_to, rows.limits(), lifetime_limits], []
+        for block in of_lifetimes:
+            if isinstance(block, History):
+                histories.append((sum(part.shape[0] for part in blocks), block))
+            blocks.append(block.matrix if isinstance(block, History) else block)
         cost, constant = np.tile(-self._weights / steps, steps), self._constant
         if aims is not None and not aims.is_circular:
             rates = over(self._ledger.rates(), intervals)
@@ -280,6 +286,7 @@ class Programs:
             under_to=np.concatenate(limits),
             low=low,
             high=high,
+            histories=tuple(histories),
         )
 
 

@@ -171,7 +171,9 @@ def solve(
         attempts = [settings for settings in attempts if settings["solver"] != "hipo"]
     # the multipliers of a rough answer are all that is asked for
     needs_plan = is_middling or (is_large and not is_rough)
-    program = _ScaledProgram(problem, np.maximum(np.abs(problem.low), np.abs(problem.high)))
+    size = np.maximum(np.abs(problem.low), np.abs(problem.high))
+    short_form = None if basis is not None else _with_short_rows(problem, size)
+    program = _ScaledProgram(*(short_form or (problem, size)))
     for settings in (None, *attempts) if basis is not None else attempts:
         highs = program.run(settings, basis if settings is None else None, primal=same_rows, is_near=is_near)
         model_status = highs.getModelStatus()
@@ -181,6 +183,8 @@ def solve(
         if not program.is_feasible(highs):
             continue
         solution = program.solution(highs)
+        if short_form is not None:
+            solution = _without_states(problem, solution)
         if not certify and model_status in (PLANNED if needs_plan else PLANNED[:1]):
             return solution
         distance = program.distance(problem, solution)
@@ -198,6 +202,51 @@ def solve(
         advice = f"; of {len(problem.cost):,} variables HiPO may: pip install 'cirl-marl[large]'" if lacks_hipo else ""
         raise SolverFailure(f"network '{name}': HiGHS did not solve {label}: {status}{advice}")
     return answer
+
+
+def _with_short_rows(problem: Program, size: Floats) -> tuple[LinearProgram, Floats] | None:
+    """Return a program with short rows for what entered lifetimes, and the size of its variables; None without any.
+
+    Its variables come after those of ``problem``, its rows of A too; its rows of G stand where they stood.
+    """
+    stays, shares, links = np.ones(len(problem.under_to), dtype=bool), [], []
+    beside, over_states, ends = [], [], list[tuple[Floats, Floats]]()
+    for first, history in problem.histories:
+        rows = slice(first, first + len(history.interval))
+        short = history.short_form(size, len(size) // problem.layout.size)
+        if short is None or not history.is_in(problem.under, rows):
+            continue
+        stays[rows] = False
+        place = sparse.eye_array(len(stays), len(history.interval), k=-first)
+        moments, states = len(short.shares.indptr) - 1, short.motion.shape[0]
+        shares += [short.shares, sparse.csr_array((states, len(size)))]
+        links.append(sparse.vstack([-sparse.eye_array(moments, moments + states), short.motion]))
+        beside.append(place @ history.beside)
+        over_states.append(place @ short.rows)
+        ends.append((short.low, short.high))
+    if not ends:
+        return None
+    low, high = (np.concatenate(values) for values in zip(*ends, strict=True))
+    places, shape = np.flatnonzero(stays), (len(stays),) * 2
+    rest = sparse.csr_array((np.ones(len(places)), (places, places)), shape=shape) @ problem.under
+    before = sparse.csr_array((len(problem.equal_to), len(low)))
+    equal = [[sparse.vstack([problem.equal, *shares]), sparse.vstack([before, sparse.block_diag(links)])]]
+    program = LinearProgram(
+        cost=np.append(problem.cost, np.zeros(len(low))),
+        equal=sparse.block_array(equal, format="csr"),
+        equal_to=np.append(problem.equal_to, np.zeros(sum(link.shape[0] for link in links))),
+        under=sparse.hstack([rest + sum(beside), *over_states], format="csr"),
+        under_to=problem.under_to,
+        low=np.append(problem.low, low),
+        high=np.append(problem.high, high),
+    )
+    return program, np.concatenate([size, np.maximum(np.abs(low), np.abs(high))])
+
+
+def _without_states(problem: Program, solution: Solution) -> Solution:
+    """Return what is of ``problem`` in a solution of the same with short rows; it has no basis."""
+    equal, under = solution.certificate.equal[: len(problem.equal_to)], solution.certificate.under
+    return Solution(solution.plan[: len(problem.cost)], Certificate(equal=equal, under=under), None)
 
 
 def best_values(problem: LinearProgram, size: Floats) -> Floats | None:

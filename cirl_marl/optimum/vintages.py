@@ -36,6 +36,7 @@ from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import Lifetime, Node
 from cirl_marl.network.lifetimes import Chain
 from cirl_marl.network.substances import follows_contents
+from cirl_marl.optimum.histories import History
 from cirl_marl.optimum.kernels import Kernel, unit_outflow
 from cirl_marl.optimum.matrices import IntervalCache, Layout
 from cirl_marl.optimum.stretched import StretchedRows, planned_turnovers
@@ -216,15 +217,15 @@ class Lifetimes:
         moments = self.network.episode.horizon * len(layout.moments)
         return moments**2 * sum(len(whole.inflow_arcs) for whole in self.whole if len(whole.rate))
 
-    def rows(self, layout: Layout, initial: Floats, intervals: range) -> tuple[Any, Floats]:
-        """Return the rows G v ≤ g of all lifetimes, and g.
+    def rows(self, layout: Layout, initial: Floats, intervals: range) -> tuple[list[Any | History], Floats]:
+        """Return the rows G v ≤ g of all lifetimes, one block after the other, and g.
 
         Args:
             layout: of the variables of the planned network.
             initial: stocks of the simulator at the start, shape (stocks,), mass.
             intervals: of the episode, one after the other.
         """
-        blocks: list[Any] = [sparse.csr_array((0, layout.size * len(intervals)))]
+        blocks: list[Any | History] = []
         limits = [np.zeros(0)]
         first = (layout.size * np.arange(len(intervals))[:, None] + layout.flow).ravel()[:, None]
         ends = (layout.size * np.arange(len(intervals))[:, None] + layout.end).ravel()[:, None]
@@ -250,20 +251,25 @@ class Lifetimes:
             # L − c̄ U ≤ from_start and c̲ U − L ≤ −from_start, in the columns of what leaves and of what enters
             write = self._chain_kernels if len(lifetime.rate) else self._line_kernels
             low, high, from_start = write(lifetime, layout, initial, intervals)
-            blocks += [outflow - high @ inflow, low @ inflow - outflow]
+            beside, kernels = [outflow, -outflow], [-high, low]
             limits += [from_start, -from_start]
             if has_steady:
                 least = low.toarray().reshape(len(intervals), -1, low.shape[1]).min(axis=1)
-                blocks.append(sparse.csr_array(least) @ inflow - steady)
+                beside.append(-steady)
+                kernels.append(sparse.csr_array(least))
                 limits.append(-from_start.reshape(len(intervals), -1).min(axis=1))
             if self._bounds_stock(lifetime, layout):
                 stock = _column_sums(ends + self.plan_network.node_index[lifetime.node.id], width)
                 kernel = self._kernel(lifetime, layout, intervals)
                 low, high = (bound.reshape(len(ends), -1) for bound in (kernel.survivors_low, kernel.survivors_high))
                 survivors = kernel.start_survivors @ lifetime.masses(initial)
-                blocks += [stock - sparse.csr_array(high) @ inflow, sparse.csr_array(low) @ inflow - stock]
+                beside += [stock, -stock]
+                kernels += [sparse.csr_array(-high), sparse.csr_array(low)]
                 limits += [survivors, -survivors]
-        return sparse.vstack(blocks, format="csr"), np.concatenate(limits)
+            interval = [np.arange(part.shape[0]) * len(intervals) // part.shape[0] for part in beside]
+            kernel = sparse.vstack(kernels, format="csr")
+            blocks.append(History(np.concatenate(interval), sparse.vstack(beside), kernel, inflow))
+        return blocks, np.concatenate(limits)
 
     def of_new(self, lifetime: WholeLifetime, layout: Layout) -> Floats:
         """Return what a unit of mass that is new in a stock at the start of each interval adds to the limits of rows.
