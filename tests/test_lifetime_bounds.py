@@ -219,6 +219,14 @@ def test_short_rows_say_the_same(
         assert (np.abs(error) <= 1e-6 * size * problem.high.max()).all()
 
 
+def test_rows_that_do_not_look_back_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """There is no state of what enters and leaves within an interval, and nothing to be shortened."""
+    monkeypatch.setattr(histories, "MANY_ENTRIES", 0)
+    monkeypatch.setattr(histories, "SHORTER", np.inf)
+    same = sparse.eye_array(3, format="csr")
+    assert History(np.arange(3), same, same, same).short_form(np.ones(3), 3) is None
+
+
 @pytest.mark.sample(2)
 @pytest.mark.parametrize("seed", [11, 12, 13, 14])
 def test_short_rows_prove_what_long_ones_prove(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
