@@ -76,6 +76,7 @@ def orders(order: float) -> Network:
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=8)
 @given(low=st.floats(0.1, 0.5), width=st.floats(0.0, 0.6), ore=st.floats(0.1, 0.6), part=st.floats(0.5, 0.98))
 @example(low=0.25, width=0.15, ore=0.3, part=0.8)

@@ -37,6 +37,7 @@ from cirl_marl.optimum.window_planner import WindowPlanner
 from cirl_marl.optimum.windows import WindowPlan, WindowTask
 
 
+@pytest.mark.slow
 def test_budgets_are_kept_at_a_price_between_the_difference_quotients() -> None:
     """The multiplier of a budget of carbon is its price, within 1 % of quotients of solved programs."""
     network = city().with_options(episode={"horizon": 14})
@@ -99,6 +100,7 @@ def test_weights_are_prices_of_budgets() -> None:
     assert dearer.objective == pytest.approx(-dearer.accounts @ [1.0, 2e3], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_mpc_keeps_budgets() -> None:
     """With the service and close to the λ̄ of the bound from the same start; stocks book too."""
     network = city()

@@ -239,6 +239,7 @@ def test_loops_without_stock_purify_as_far_as_they_do(seed: int, mines: int, con
     assert replace(network, services=(limits[1],), uncertain=drawn)
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**31), kind=st.sampled_from(["transfer", "share", "uncertain"]))
 @example(seed=1004, kind="share")  # the most has not settled after many rounds, the least has
 @settings(max_examples=30)

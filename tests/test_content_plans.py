@@ -102,7 +102,7 @@ def test_contents_of_flows_are_in_the_ranges_of_programs(network: Network, seed:
 @example(  # slots of a fixed lifetime begin at other times than its history
     network=with_substances(random_network(453209963, 10, 1, lifetimes=True), 453209963), seed=0, degree=1, large=1
 )
-@pytest.mark.medium
+@pytest.mark.slow
 def test_no_episode_with_its_contents_is_above_their_bound(
     network: Network, seed: int, degree: int, large: int
 ) -> None:

@@ -227,7 +227,7 @@ def test_rows_that_do_not_look_back_stay(monkeypatch: pytest.MonkeyPatch) -> Non
     assert History(np.arange(3), same, same, same).short_form(np.ones(3), 3) is None
 
 
-@pytest.mark.sample(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [11, 12, 13, 14])
 def test_short_rows_prove_what_long_ones_prove(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The certificate is one of the program as it is, whichever way it was solved; what is left out costs little."""

@@ -281,7 +281,7 @@ def test_weight_decides_whether_service_is_worth_its_price() -> None:
 
 
 @pytest.mark.parametrize(("name", "horizon"), [("copper_net", None), ("copper_net", 12), ("carbo_net", None)])
-@pytest.mark.medium
+@pytest.mark.slow
 @pytest.mark.sample(1)
 def test_keeps_the_service_from_random_starts(name: str, horizon: int | None) -> None:
     """From drawn starts it meets the demanded level, nearer than open-loop plans, within 3 % of the bound."""

@@ -311,6 +311,7 @@ def test_with_enough_material_the_bound_is_reached() -> None:
     np.testing.assert_allclose(followed.circularity_mean.mean(), solved.value, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_mpc_meets_what_each_customer_orders() -> None:
     """Programs promise a little more than passes a market, and so plans leave that much over there."""
     horizon, mine = 8, Control(kind=ControlKind.FLOW, low=0.0, neutral=10.0, high=40.0)

@@ -147,7 +147,7 @@ def seasonal() -> Network:
     )
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_feedback_is_between_the_blind_and_the_best() -> None:
     """Of expectations over all paths none exceeds the best policy's; scenario MPC is near it, and blind ones are not.
 
@@ -419,7 +419,7 @@ def test_a_margin_is_of_every_service_or_of_each(name: str) -> None:
         named_controller(name, margin=[1.0, -1.0], **options)
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_all_are_compared_by_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     """All controllers by name, against the bound on common draws; rows that miss their service are named."""
     monkeypatch.setattr(calibration, "TRIES", 1)

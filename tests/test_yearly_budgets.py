@@ -101,7 +101,7 @@ def test_the_budget_of_the_only_year_is_that_of_the_episode() -> None:
     np.testing.assert_array_equal(in_all.actions, in_year.actions)
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 @given(
     network=st.from_type(Network),
     interval=st.floats(0.2, 0.7),
