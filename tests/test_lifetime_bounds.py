@@ -36,7 +36,7 @@ from cirl_marl.controllers import Constant, Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.network.elements import Lifetime
 from cirl_marl.network.lifetimes import Chain, chain_of
-from cirl_marl.optimum import bound, envelope, histories, improve_plan, simulate_plan, vintages
+from cirl_marl.optimum import bound, envelope, histories, improve_plan, simulate_plan, solver, vintages
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.histories import History
 from cirl_marl.optimum.kernels import Kernel
@@ -193,7 +193,7 @@ def test_short_rows_say_the_same(
     lifetime: Lifetime, stretch: float | Series, pieces: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of whatever enters, with states that stay in their boxes; and nothing of rows of another program."""
-    monkeypatch.setattr(histories, "MANY_ENTRIES", 0)
+    monkeypatch.setattr(solver, "MANY_ENTRIES", 0)
     monkeypatch.setattr(histories, "SHORTER", np.inf)
     years, rng = 9, np.random.default_rng(pieces)
     network = town(lifetime, INFLOW[:years], initial=30.0, stretch=stretch)
@@ -221,7 +221,7 @@ def test_short_rows_say_the_same(
 
 def test_rows_that_do_not_look_back_stay(monkeypatch: pytest.MonkeyPatch) -> None:
     """There is no state of what enters and leaves within an interval, and nothing to be shortened."""
-    monkeypatch.setattr(histories, "MANY_ENTRIES", 0)
+    monkeypatch.setattr(solver, "MANY_ENTRIES", 0)
     monkeypatch.setattr(histories, "SHORTER", np.inf)
     same = sparse.eye_array(3, format="csr")
     assert History(np.arange(3), same, same, same).short_form(np.ones(3), 3) is None
@@ -233,7 +233,7 @@ def test_short_rows_prove_what_long_ones_prove(seed: int, monkeypatch: pytest.Mo
     """The certificate is one of the program as it is, whichever way it was solved; what is left out costs little."""
     network = yearly_network(seed, replace(LIFETIMES, years=(8, 12), regions=(1, 1), products=(1, 3)))
     expected = bound(network, min_service=0.9)
-    monkeypatch.setattr(histories, "MANY_ENTRIES", 0)
+    monkeypatch.setattr(solver, "MANY_ENTRIES", 0)
     monkeypatch.setattr(histories, "SHORTER", np.inf)
     found = bound(network, min_service=0.9)
     assert expected.problem.histories and found.basis is None
@@ -582,3 +582,18 @@ def test_bounds_of_degree_1_have_few_pieces(monkeypatch: pytest.MonkeyPatch) -> 
     fine = bound(network, min_service=0.95, degree=1)
     assert rough.problem.layout.pieces < fine.problem.layout.pieces
     assert rough.objective == pytest.approx(fine.objective, rel=1e-3)
+
+
+def test_windows_that_were_made_of_a_program_are_solved_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They have columns and rows of their own, so that short rows are not theirs; what MPC does stays the same."""
+    network = yearly_network(11, replace(LIFETIMES, years=(8, 8), regions=(1, 1), products=(1, 2)))
+    runs = []
+    for entries in (histories.MANY_ENTRIES, 0):
+        monkeypatch.setattr(solver, "MANY_ENTRIES", entries)
+        monkeypatch.setattr(histories, "SHORTER", np.inf)
+        runs.append(rollout(MultiAgentVectorEnv(network, num_envs=1), MPC(horizon=4, min_service=0.9)))
+    circularity, levels = zip(
+        *((float(run.episode_circularity[0]), run.episode_levels[0]) for run in runs), strict=True
+    )
+    assert circularity[1] == pytest.approx(circularity[0], rel=1e-2)
+    np.testing.assert_allclose(levels[1], levels[0], atol=5e-3)

@@ -46,6 +46,11 @@ class History:
         """The rows over the variables, sparse."""
         return sparse.csr_array(self.beside + self.kernel @ self.inflow)
 
+    @property
+    def entries(self) -> float:
+        """How many entries the matrix has, about."""
+        return float(self.kernel.nnz * self.inflow.nnz / self.inflow.shape[0])
+
     def is_in(self, matrix: Any, rows: slice) -> bool:
         """Whether these rows of a matrix are still these, and not those of another program that was made of it."""
         return bool(matrix.shape[1] == self.beside.shape[1] and (matrix[rows] != self.matrix).nnz == 0)
@@ -57,9 +62,6 @@ class History:
             size: of each variable, the largest that it will be.
             intervals: of the program.
         """
-        entries = self.kernel.nnz * self.inflow.nnz / self.inflow.shape[0]
-        if entries < MANY_ENTRIES:
-            return None
         box = self.inflow @ size
         box[box == 0] = 1.0
         kernel = self.kernel.toarray() * box
@@ -93,7 +95,7 @@ class History:
             low=np.concatenate([np.zeros(len(box)), *(np.minimum(part, 0.0).sum(axis=0) for part in ranges)]),
             high=np.concatenate([np.ones(len(box)), *(np.maximum(part, 0.0).sum(axis=0) for part in ranges)]),
         )
-        return form if form.motion.nnz + form.rows.nnz <= SHORTER * entries else None
+        return form if form.motion.nnz + form.rows.nnz <= SHORTER * self.entries else None
 
 
 @positional_record

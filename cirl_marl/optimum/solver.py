@@ -19,6 +19,7 @@ from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.optimum.admissible import NoCertificate
 from cirl_marl.optimum.certificate import Certificate, verify
+from cirl_marl.optimum.histories import MANY_ENTRIES
 from cirl_marl.optimum.interruption import run_until_interrupt
 from cirl_marl.optimum.program import LinearProgram, Program
 
@@ -213,8 +214,10 @@ def _with_short_rows(problem: Program, size: Floats) -> tuple[LinearProgram, Flo
     beside, over_states, ends = [], [], list[tuple[Floats, Floats]]()
     for first, history in problem.histories:
         rows = slice(first, first + len(history.interval))
+        if history.entries < MANY_ENTRIES or not history.is_in(problem.under, rows):
+            continue
         short = history.short_form(size, len(size) // problem.layout.size)
-        if short is None or not history.is_in(problem.under, rows):
+        if short is None:
             continue
         stays[rows] = False
         place = sparse.eye_array(len(stays), len(history.interval), k=-first)
