@@ -17,6 +17,7 @@ from cirl_marl.learners.interface import default_recipe, prepare
 from cirl_marl.learners.policies import Policies
 from cirl_marl.learners.recipe import LearnerSettings, Recipe, Run
 from cirl_marl.learners.stacked import gradient_ascent
+from cirl_marl.learners.stacked.control_variates import ControlVariates
 from cirl_marl.learners.stacked.gradient_ascent import GradientStack
 
 PARAMETERS = {"policy_kwargs": {"net_arch": [4]}, "max_grad_norm": 1e9, "n_steps": 4, "batch_size": 8}
@@ -68,7 +69,8 @@ def test_gradients_go_through_the_policies(
             for t in range(len(tape)):
                 outputs = stack._weights.actor.forward(inputs)[-1].numpy()
                 actions = np.empty_like(tape[0][0].actions)
-                for rows, entries in zip(outputs, stack._acted, strict=True):
+                for rows, member in zip(outputs, stack.members, strict=True):
+                    entries = env.actuators.entries[member.name]
                     actions[entries] = np.clip(rows[:, : entries.stop - entries.start], -1, 1).T
                 env.advance(actions)
                 if t + 1 < len(tape):
@@ -78,7 +80,8 @@ def test_gradients_go_through_the_policies(
                     before = env.stacked_observation()
                     env.go_back(now_here, controls)
                     change = np.zeros(inputs.shape)
-                    for rows, span in zip(change, stack._observed, strict=True):
+                    for rows, member in zip(change, stack.members, strict=True):
+                        span = env.layout.slices[member.name]
                         rows[:, : span.stop - span.start] = (seen[span] - before[span]).T
                     inputs = tape[t + 1][1][0] + torch.as_tensor(share * change * tape[t + 1][2], dtype=torch.float32)
             state = env.physical
@@ -141,15 +144,39 @@ def test_actors_that_climbed_are_those_of_the_models(algorithm: str) -> None:
     assert paid[1] > paid[0] + 0.01
 
 
+@pytest.mark.parametrize("budgets", [{}, {"emissions": -50.0, "cost": 20.0}], ids=["services", "budgets"])
+def test_mending_makes_good_what_lacks(monkeypatch: pytest.MonkeyPatch, budgets: dict[str, float]) -> None:
+    """To first order: what lacks of levels and budgets in the coming episode; the environment stays where it is."""
+    monkeypatch.setattr(gradient_ascent, "FEEDBACK", 1.0)
+    asked = {"steps": 16, "evaluations": 1, "at_most": budgets, "price_rate": 0.1}
+    climb = recipe(asked, parameters={**PARAMETERS, "learning_rate": 1e-3})
+    training = train(booked(load_network("carbo_net"), 2, efforts=False), climb, seed=4)
+    (stack,) = training._stacks
+    assert isinstance(stack, GradientStack)
+    lacks, excess = np.array([0.03, 0.01]), np.array([0.02, 0.0][: len(budgets)])
+    before, end = stack._env.physical, stack.parameters
+    change = stack.mending(lacks, excess)
+    assert stack._env.physical is before and torch.equal(stack.parameters, end)
+
+    def lacking(share: float) -> float:
+        stack.parameters = end + share * change
+        stack._look_ahead()
+        levels = stack._tape[-1][0].after.service.mean(axis=1) / len(stack._tape)
+        return float(lacks @ levels - excess @ (stack._amounts().mean(axis=0) / stack._aims.sizes))
+
+    slope = (lacking(0.01) - lacking(-0.01)) / 0.02
+    assert slope == pytest.approx(lacks @ lacks + excess @ excess, rel=0.02)
+
+
 def test_each_service_has_a_price(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its logarithm moves by what an evaluation would lack of it, and what follows is paid at that price."""
-    move, errors = GradientStack._move_prices, list[np.ndarray]()
+    move, errors, variates = GradientStack._move_prices, list[np.ndarray](), ControlVariates()
     model: list[Any] = []
 
     def watch(stack: GradientStack, levels: np.ndarray, accounts: np.ndarray) -> None:
         move(stack, levels, accounts)
         doubt = 2 * 1.645 * levels.std(axis=1) / 3  # of nine episodes
-        lower = levels.mean(axis=1) - np.maximum(doubt, 0.05 * 0.02)
+        lower = levels.mean(axis=1) - variates.luck(stack._draws(), levels.T) - np.maximum(doubt, 0.05 * 0.02)
         errors.append(np.clip((0.98 - lower) / 0.02, -1, 1))
         model[:] = [stack._models[0], stack._prices]
 

@@ -137,7 +137,7 @@ def test_truncation_bootstraps() -> None:
     def hook(infos: Any, done: np.ndarray) -> None:
         if done.any():
             finals.append(infos["use"]["final_obs"].copy())
-            last.append(agent_env.rewards_and_dones()[0])
+            last.append(agent_env.last_step.rewards.copy())
 
     Lockstep([world], [Participant("use", learn, hold(agent_env), streams)]).run([hook])
     assert np.allclose(rewards[0], last[0] + 0.9 * values[0], atol=1e-4)

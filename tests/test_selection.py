@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from small_networks import ACCOUNTS, booked
@@ -24,7 +25,8 @@ from cirl_marl.learners.interface import Trained, resume, train
 from cirl_marl.learners.policies import Policies, Policy
 from cirl_marl.learners.recipe import LearnerSettings, Recipe, Run
 from cirl_marl.learners.run_directory import RunDirectory
-from cirl_marl.learners.stacked import gradient_ascent
+from cirl_marl.learners.stacked.gradient_ascent import GradientStack
+from cirl_marl.learners.stacked.stack import StackedPolicies
 from cirl_marl.learners.validation import FIRST_SEED, LARGEST_MULTIPLIER, Multipliers, Score, validation_score
 
 HORIZON, STEPS = 6, 96
@@ -58,53 +60,50 @@ def numbers(policy: Policy) -> np.ndarray:
     return np.concatenate([*weights, moments.mean, moments.var])
 
 
-@pytest.mark.parametrize(
-    ("first", "mean", "rest"),
-    [
-        (0.995, 0.98, [0.995, 0.985, 0.985, 0.991, 0.995, 0.985, 0.985, 0.991]),
-        (0.985, 0.995, [0.985, 0.995, 0.985, 0.985]),
-        (0.985, 0.98, []),
-    ],
-    ids=["the first serves", "the mean serves", "nothing serves"],
-)
+@pytest.mark.parametrize("needed", [0.5, 6.7, 1000.0], ids=["at once", "further", "never"])
 @pytest.mark.sample(1)
-def test_policies_near_the_last_serve_just_enough(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, first: float, mean: float, rest: list[float]
+def test_what_lacks_at_the_end_is_made_good_by_the_nearest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, needed: float
 ) -> None:
-    """Of two evaluations the last does not serve: their mean acts if it does, or what is between who serves and it."""
-    seen: list[np.ndarray] = []
-    assured = [first, 0.98, mean, *rest]
+    """Policies move up the gradient of what lacks as far as they must, and those act; a training itself ends alike."""
+    seen: list[tuple[float, torch.Tensor, np.ndarray]] = []
+    changes: list[torch.Tensor] = []
+    mending = GradientStack.mending
 
-    def score(env: MultiAgentVectorEnv, policies: Policies, aims: object) -> Score:
-        seen.append(numbers(policies.policies["mine"]))
-        return Score(float(len(seen)), 1.0, assured[len(seen) - 1], 0.0)
+    def watch(stack: GradientStack, lacks: np.ndarray, excess: np.ndarray) -> torch.Tensor:
+        np.testing.assert_allclose(lacks, [0.01])
+        changes.append(mending(stack, lacks, excess))
+        return changes[0]
+
+    def score(env: MultiAgentVectorEnv, policies: StackedPolicies, aims: object) -> Score:
+        stack = policies._parts[0][0]
+        assert isinstance(stack, GradientStack)
+        far = 0.0
+        if changes:
+            far = float(((stack.parameters - seen[1][1]) * changes[0]).sum() / changes[0].square().sum())
+        mine = next(member.policy for member in stack.members if member.name == "mine")
+        seen.append((far, stack.parameters, numbers(mine)))
+        level = 0.98 + 0.01 * far / needed
+        return Score(-far, level, level, 0.0, {"copper_in_use": level})
 
     monkeypatch.setattr(trainer, "validation_score", score)
-    monkeypatch.setattr(trainer, "StackedPolicies", lambda all_, _: Policies({k: v.policy for k, v in all_.items()}))
+    monkeypatch.setattr(GradientStack, "mending", watch)
     climb = recipe(engine="gradients", min_service=0.99, steps=24, evaluations=2)
     options: dict[str, Any] = {"horizon": HORIZON, "circularity": "mean"}
-    before = numbers(train("copper_net", climb, steps=12, **options).learners["mine"].policy)  # its last update
-    seen.clear()
-    training = train("copper_net", climb, directory=tmp_path / "run", **options)
-    last, policy = numbers(training.learners["mine"].policy), training.learners["mine"].policy
-    assert policy.normaliser is not None
-    weights = len(last) - 2 * len(observation_statistics(policy.normaliser)["observation"].mean)
-    # each is evaluated and expected; moments have no mean of their own
-    expected = [seen[0], last, before + gradient_ascent.MEAN_SHARE * (last - before)]
-    expected[2][weights:] = last[weights:]
-    acting = expected[0] if first > 0.99 else expected[2]
-    for place in range(0, len(rest), 4):
-        origin, end, low, high = acting, last if place == 0 else expected[2], 0.0, 1.0
-        for level in rest[place : place + 4]:
-            share = (low + high) / 2
-            expected.append((1 - share) * origin + share * end)
-            low, high, acting = (share, high, expected[-1]) if level > 0.99 else (low, share, acting)
-    np.testing.assert_allclose(seen, expected, atol=1e-6)
-    assert not np.allclose(expected[2], last, atol=1e-4)
-    if not rest:
-        acting = expected[0]
-    np.testing.assert_allclose(numbers(Trained(tmp_path / "run").policies["mine"]), acting, atol=1e-6)
+    last = numbers(train("copper_net", climb, directory=tmp_path / "run", **options).learners["mine"].policy)
+    tried = [far for far, *_ in seen[2:]]
+    bracket = [far for far in (1, 4, 16, 64, 256) if far < 4 * needed]
+    np.testing.assert_allclose(tried[: len(bracket)], bracket, rtol=1e-3)
+    nearest = min((far for far in tried if far >= needed), default=256.0)
+    if needed < 256.0:
+        assert len(tried) == len(bracket) + trainer.HALVINGS
+        assert nearest - needed <= bracket[-1] / 2**trainer.HALVINGS
+    acting = numbers(Trained(tmp_path / "run").policies["mine"])
+    np.testing.assert_array_equal(acting, next(each for far, _, each in seen if far == pytest.approx(nearest)))
+    np.testing.assert_array_equal(last, seen[1][2])
+    assert not np.allclose(acting, last, atol=1e-6)
     seen.clear()  # a training that is kept nowhere tries nothing, and ends alike
+    changes.clear()
     np.testing.assert_array_equal(numbers(train("copper_net", climb, **options).learners["mine"].policy), last)
     assert len(seen) == 2
 

@@ -92,7 +92,6 @@ class AgentVecEnv(VecEnv):
 
     Attributes:
         name: of the learner; an independent learner has its agent's.
-        last_step: the outcome of the last joint step.
         action: its last one.
         wait: returns when every learner has handed in its actions and the joint environment has moved.
         bootstrap: whether time limits are reported as truncations, after which the learner expects more to come.
@@ -102,7 +101,8 @@ class AgentVecEnv(VecEnv):
     def __init__(self, env: BatchedEnv, name: str, view: View, row: Callable[..., Any] = AgentInNetworkCopy) -> None:
         """Show ``env`` by ``view``; ``row`` makes what ``env_method`` and ``get_attr`` reach: of copy and agent."""
         self.name, self.view, self.copies = name, view, env.num_envs
-        self.last_step: StepResult = _NO_STEP
+        self._joint_step: JointStep | None = None
+        self.last_step = _NO_STEP
         self.action: NDArray[np.float32] | None = None
         self.bootstrap, self.centre_rewards = True, False
         self.views = [row(env, i, agent) for agent in view.row_agents or (None,) for i in range(self.copies)]
@@ -126,27 +126,56 @@ class AgentVecEnv(VecEnv):
         return False
 
     def receive_step(self, step: JointStep) -> None:
-        """Take over the outcome of a joint step."""
+        """Take over the outcome of a joint step; what of it is the learner's is looked up when somebody asks."""
+        self._joint_step = step
+
+    @property
+    def last_step(self) -> StepResult:
+        """The outcome of the last joint step."""
+        if self._joint_step is not None:
+            self.last_step = self._result_of(self._joint_step)
+        return self._last_step
+
+    @last_step.setter
+    def last_step(self, result: StepResult) -> None:
+        self._last_step, self._joint_step = result, None
+
+    def _result_of(self, step: JointStep) -> StepResult:
         agents, rows = self.view.agents, self.view.row_agents or self.view.agents[:1]
-        observation = _in_rows(self.view.observe(step.observations, step.state))
-        rewards = self.view.score(step.rewards).astype(np.float32)
-        dones = np.concatenate([step.dones[agent] for agent in rows])
+        observation, rewards, dones = _in_rows(self.observation), self.rewards.astype(np.float32), self.dones
         if not dones.any():
-            self.last_step = StepResult(observation, rewards, dones)
-            return
+            return StepResult(observation, rewards, dones)
         final_by_agent = {agent: step.infos[agent]["final_obs"] for agent in agents}
         final = _in_rows(self.view.observe(final_by_agent, lambda: step.infos[agents[0]]["final_info"]["state"]))
         returns, lengths = self.view.score(step.returns), np.concatenate([step.lengths[agent] for agent in rows])
         truncated = np.concatenate([step.truncated[agent] for agent in rows])
-        self.last_step = StepResult(observation, rewards, dones, final, returns, lengths, truncated)
+        return StepResult(observation, rewards, dones, final, returns, lengths, truncated)
 
-    def rewards_and_dones(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Return the reward of each row, and whether its episode ended; copies, as PPO adds to rewards in place."""
-        rewards = self.last_step.rewards.copy()
+    @property
+    def observation(self) -> ObservedRows:
+        """What each row sees now, in whatever order of memory."""
+        if (step := self._joint_step) is None:
+            return self._last_step.observation
+        return self.view.observe(step.observations, step.state)
+
+    @property
+    def rewards(self) -> NDArray[np.floating]:
+        """The reward of each row in the last step, not centred."""
+        step = self._joint_step
+        return self._last_step.rewards if step is None else self.view.score(step.rewards)
+
+    @property
+    def dones(self) -> NDArray[np.bool_]:
+        """Which rows' episodes ended with the last step."""
+        if (step := self._joint_step) is None:
+            return self._last_step.dones
+        return np.concatenate([step.dones[agent] for agent in self.view.row_agents or self.view.agents[:1]])
+
+    def centre(self, rewards: NDArray[np.float32]) -> None:
+        """Take the mean over copies off the rewards of the rows, if that is asked for."""
         if self.centre_rewards:
             by_agent = rewards.reshape(-1, self.copies)
             by_agent -= by_agent.mean(axis=1, keepdims=True)
-        return rewards, self.last_step.dones.copy()
 
     def reset(self) -> VecEnvObs:
         """Return the current observation of every copy."""
@@ -161,7 +190,8 @@ class AgentVecEnv(VecEnv):
     def step_wait(self) -> VecEnvStepReturn:
         """Wait until every learner has handed in its actions and the joint environment has moved."""
         self.wait()
-        rewards, dones = self.rewards_and_dones()
+        rewards, dones = self.last_step.rewards.copy(), self.last_step.dones.copy()  # PPO adds to rewards in place
+        self.centre(rewards)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         now = self.last_step
         if now.final_observation is not None and now.returns is not None and now.lengths is not None:

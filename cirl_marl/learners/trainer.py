@@ -16,22 +16,22 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
+from torch import Tensor
 
 from cirl_marl.environments.rewards import CIRCULARITY_REWARDS
 from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RecipeError, RunError, instance_of, unknown_name
 from cirl_marl.learners.checkpoint import read_tree, write_tree
 from cirl_marl.learners.demonstrations import Demonstrator
-from cirl_marl.learners.learner import Learner, derived_seed, has_tensorboard, load_acting_learner
+from cirl_marl.learners.learner import Learner, derived_seed, has_tensorboard
 from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, Streams, TrainingStop
-from cirl_marl.learners.policies import Policies
 from cirl_marl.learners.recipe import Start
 from cirl_marl.learners.run_directory import RunConfig, RunDirectory, TableFile, steps_of
 from cirl_marl.learners.stacked.conditions import gradient_obstacle, gradient_stacks, obstacle, stacks
+from cirl_marl.learners.stacked.gradient_ascent import GradientStack
 from cirl_marl.learners.stacked.stack import Stack, StackedPolicies
 from cirl_marl.learners.start import begin_again, begin_from
 from cirl_marl.learners.validation import Multipliers, Rank, Score, validation_score
-from cirl_marl.learners.weight_path import WeightPath, mean_numbers, numbers_of
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import CIRCULARITY
 from cirl_marl.optimum.aims import aims_of
@@ -49,7 +49,9 @@ EVALUATION_COLUMNS = (
 )  # fmt: skip
 """Columns of ``evaluations.csv``."""
 HALVINGS = 4
-"""Policies that are tried between those that serve and the last ones."""
+"""Policies that are tried between the last ones and those that serve."""
+LARGEST_MENDING = 256.0
+"""How far they are looked for: so many times what would do to first order, which is little where clips bind."""
 COST = 0.02
 """Part of the time that checkpoints may take; they come less often if the last one took more."""
 
@@ -276,7 +278,7 @@ class Training:
         self._evaluate()
         self._bring_up_to_date()
         if self.run is not None:
-            self._try_others(self.run)
+            self._mend()
             partial_folder = self.run.begin_checkpoint()
             for learner in self.learners.values():
                 learner.write_state(partial_folder, {}, last=True)
@@ -376,33 +378,32 @@ class Training:
         budgets = {budget.name: budget.most for budget in self._aims.budgets}
         return score.rank(self.config.recipe.run.min_service, budgets)
 
-    def _try_others(self, run: RunDirectory) -> None:
-        """Where the last policies of exact gradients lack what is demanded, let the best of others near them act.
+    def _mend(self) -> None:
+        """Where the last policies of exact gradients lack what is demanded, let the nearest act that do not.
 
-        These are the mean of the last ones, and what lies between those that act, if they serve, and either.
+        They are looked for up the gradient of what lacks, where it costs least.
         """
-        env, last, learners = self._validation_env, self._last_score, self.learners
-        if self.config.recipe.run.engine != "gradients" or env is None or last is None or self._rank(last)[0]:
+        last, settings = self._last_score, self.config.recipe.run
+        if settings.engine != "gradients" or last is None or settings.min_service is None or self._rank(last)[0]:
             return
-        end, mean = numbers_of(learners), mean_numbers(learners)
-        is_served = self._try_share(WeightPath(learners, end, mean), 1.0)
-        for target in (end,) if is_served else (end, mean):
-            if self._best is None or not self._rank(self._best)[0]:
-                break
-            folder = run.acting_checkpoint
-            origins = {name: load_acting_learner(folder, group, env) for name, group in self.groups.items()}
-            path, low, high = WeightPath(learners, numbers_of(origins), target), 0.0, 1.0
-            for _ in range(HALVINGS):
-                share = (low + high) / 2
-                low, high = (share, high) if self._try_share(path, share) else (low, share)
-        WeightPath(learners, end, end).set(1.0)
+        lacks = np.maximum(0.0, settings.min_service - np.array([*last.levels.values()]))
+        amounts = np.array([last.accounts[budget.name] for budget in self._aims.budgets])
+        excess = np.maximum(0.0, (amounts - self._aims.limits) / self._aims.sizes)
+        stack = next(stack for stack in self._stacks if stack.members[0] in self.learners.values())
+        assert isinstance(stack, GradientStack)
+        end, change, low, high = stack.parameters, stack.mending(lacks, excess), 0.0, 1.0
+        while high <= LARGEST_MENDING and not self._is_enough(stack, end + high * change):
+            low, high = high, 4.0 * high
+        for _ in range(HALVINGS if high <= LARGEST_MENDING else 0):
+            middle = (low + high) / 2
+            low, high = (low, middle) if self._is_enough(stack, end + middle * change) else (middle, high)
+        stack.parameters = end
 
-    def _try_share(self, path: WeightPath, share: float) -> bool:
-        """Validate policies on a path, keep them if they are the best, and return whether they keep all demands."""
+    def _is_enough(self, stack: GradientStack, parameters: Tensor) -> bool:
+        """Validate policies with these parameters, keep them if they are the best, and return whether nothing lacks."""
         assert self._validation_env is not None
-        path.set(share)
-        policies = Policies({name: learner.policy for name, learner in self.learners.items()})
-        score = validation_score(self._validation_env, policies, self._aims)
+        stack.parameters = parameters
+        score = validation_score(self._validation_env, StackedPolicies(self.learners, [stack]), self._aims)
         self._keep_if_best(score)
         return self._rank(score)[0]
 

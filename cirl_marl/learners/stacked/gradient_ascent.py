@@ -30,10 +30,11 @@ from cirl_marl.environments.state import Interval, State
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.learners.learner import Learner
 from cirl_marl.learners.recipe import Run
+from cirl_marl.learners.stacked.control_variates import ControlVariates
 from cirl_marl.learners.stacked.perceptrons import chain, write_gradients
 from cirl_marl.learners.stacked.stack import ActorStack
 from cirl_marl.learners.validation import QUANTILE_95, budget_levels, charges_of, first_prices, price_step
-from cirl_marl.network import Floats
+from cirl_marl.network import Floats, Integers
 from cirl_marl.network.elements import CIRCULARITY
 from cirl_marl.optimum.aims import aims_of
 
@@ -45,10 +46,28 @@ MARGIN = 0.05
 """Least margin of a service, in parts of what may lack: where nothing is random its level swings about the demand."""
 LARGEST_NORM = 0.2
 """Norm to which gradients are clipped where the algorithm has no ``max_grad_norm``."""
-MEAN_SHARE = 0.05
-"""Share of an update in the mean of the last policies: swings of prices take some twenty updates."""
 LEAST_PRICE = 1e-4
 """Below which no price falls, per circularity scale."""
+
+
+class Places:
+    """Where the rows of a stacked array stand in one with a padded row of entries for each member, (N, B, entries).
+
+    Attributes:
+        rows: of the stacked array, member by member.
+        index: of the same entries in the other.
+    """
+
+    def __init__(self, spans: Sequence[slice]) -> None:
+        """Take the rows of each member in the stacked array."""
+        lengths = [span.stop - span.start for span in spans]
+        self.rows: Integers = np.concatenate([np.arange(span.start, span.stop) for span in spans])
+        members = np.repeat(np.arange(len(spans)), lengths)
+        self.index = (members, slice(None), np.concatenate([np.arange(length) for length in lengths]))
+
+    def of(self, padded: NDArray[Any]) -> NDArray[Any]:
+        """Return entries of the padded array in the order of ``rows``, shape (rows, B)."""
+        return padded[self.index]
 
 
 class GradientStack(ActorStack):
@@ -61,8 +80,8 @@ class GradientStack(ActorStack):
         self._derivatives, self._run = Derivatives(self._env), run
         # where the entries of each agent's observation and action stand in the stacks of all
         names = [member.name for member in members]
-        self._observed = [self._env.layout.slices[name] for name in names]
-        self._acted = [self._env.actuators.entries[name] for name in names]
+        self._observed = Places([self._env.layout.slices[name] for name in names])
+        self._acted = Places([self._env.actuators.entries[name] for name in names])
         first, weight = self._models[0], max(self._env.circularity_weight, 1e-6)
         stated = np.array([service.weight for service in self._env.network.services]) * (1.0 - weight) / weight
         self._prices: Floats = getattr(first, "service_prices", stated)
@@ -72,12 +91,14 @@ class GradientStack(ActorStack):
         start = first_prices(self._aims, network.episode.horizon)
         self._budget_prices: tuple[Floats, Floats] = getattr(first, "budget_prices", (start, start))
         self._charges = np.array(self._env.account_charges)
+        self._variates = ControlVariates(getattr(first, "control_variates", None))
+        self._drawn_stocks = np.flatnonzero(np.ptp(network.initial, axis=0))
 
     def _keep_progress(self) -> None:
         """Leave with the first model what a resumed training needs beside it: prices, and where the episode begins."""
         first = self._models[0]
         first.service_prices, first.price_integrals = self._prices, self._integrals
-        first.budget_prices = self._budget_prices
+        first.budget_prices, first.control_variates = self._budget_prices, self._variates.state
         if not self._is_restoring:
             first.episode_start = asdict(self._env.physical)
 
@@ -100,31 +121,88 @@ class GradientStack(ActorStack):
             before = interval.after
             self._tape.append((interval, values, slopes))
             self._timesteps += self._env.num_envs
-            is_over = bool(self._inputs.rewards_and_dones()[1].all())
+            is_over = bool(self.members[0].agent_env.dones.all())
 
     def _again(self, before: State, outputs: Tensor) -> Interval:
         """Return an interval that a resumed training has behind it; the environment stays where it is."""
-        env, actions = self._env, np.empty((len(self._env.actuators.control_rows), self._env.num_envs))
-        now, controls = env.physical, env.controls
-        for rows, entries in zip(outputs.cpu().numpy(), self._acted, strict=True):
-            actions[entries] = np.clip(rows[:, : entries.stop - entries.start], -1.0, 1.0).T
+        env, now, controls = self._env, self._env.physical, self._env.controls
         env.go_back(before, controls)
-        env.advance(actions)
+        self._advance(outputs)
         interval = env.interval
         env.go_back(now, controls)
         return interval
 
+    def _advance(self, outputs: Tensor) -> None:
+        """Move the environment itself by what policies put out."""
+        actions = np.empty((len(self._env.actuators.control_rows), self._env.num_envs))
+        actions[self._acted.rows] = np.clip(self._acted.of(outputs.cpu().numpy()), -1.0, 1.0)
+        self._env.advance(actions)
+
+    def _look_ahead(self) -> None:
+        """Play the episode that begins, without a trace but the tape."""
+        env, now, controls = self._env, self._env.physical, self._env.controls
+        self._tape = []
+        while (env.physical.step < env.network.episode.horizon).all():
+            observations = env.by_agent(env.stacked_observation())
+            seen = [member.agent_env.view.rows(observations) for member in self.members]
+            inputs = self._inputs.normalise(seen, slice(None))
+            values = self._weights.actor.forward(inputs[..., : self._inputs.local])
+            self._advance(values[-1])
+            self._tape.append((env.interval, values, self._inputs.slopes))
+        env.go_back(now, controls)
+
     def _climb(self, progress_remaining: float) -> None:
-        """Go back through the episode, and let every policy climb."""
+        """Let every policy climb what the episode is worth."""
+        weights, model = self._weights, self._models[0]
+        charges = self._charges[:, None] + charges_of(self._env, self._aims, self._budget_prices[1])
+        self._write_gradient(1.0, self._prices, charges)
+        rate = model.lr_schedule(progress_remaining)
+        update_learning_rate(weights.optimiser, rate)
+        weights.clip(getattr(model, "max_grad_norm", LARGEST_NORM))
+        weights.optimiser.step()
+        self._updates += 1
+        after, length = self._tape[-1][0].after, len(self._tape)
+        levels = after.service / length
+        self._move_prices(levels, self._amounts())
+        self._log(float(after.circularity.mean()) / length, levels.mean(axis=1), rate)
+
+    @property
+    def parameters(self) -> Tensor:
+        """What policies act by, shape (learners, parameters); a copy."""
+        return self._weights.matrix.detach().clone()
+
+    @parameters.setter
+    def parameters(self, matrix: Tensor) -> None:
+        self._weights.matrix.copy_(matrix)
+        self._give_models()
+
+    def mending(self, lacks: Floats, excess: Floats) -> Tensor:
+        """Return a change of all parameters after which, to first order, nothing lacks in the coming episode.
+
+        It leads up the gradient of what lacks. Where policies are the best for some price this is a cheapest way: it
+        costs that price.
+
+        Args:
+            lacks: of the level of each service, shape (services,).
+            excess: of each budget, in parts of it, shape (budgets,).
+        """
+        self._look_ahead()
+        self._write_gradient(0.0, lacks, charges_of(self._env, self._aims, excess))
+        gradient = self._weights.gradient
+        wanted, slope = float(lacks @ lacks + excess @ excess), float(gradient.square().sum())
+        return gradient * (-wanted / slope if slope > 0.0 else 0.0)
+
+    def _write_gradient(self, weight: float, prices: Floats, charges: Floats) -> None:
+        """Go back through the episode; ``weight`` is that of circularity, ``charges`` are by account."""
         env, weights, length = self._env, self._weights, len(self._tape)
         count = length * env.num_envs
-        by_circularity = np.full(env.num_envs, 1.0 / (env.network.objective.circularity_scale * count))
-        by_level = np.repeat(self._prices[:, None] / count, env.num_envs, axis=1)
-        charges = self._charges[:, None] + charges_of(env, self._aims, self._budget_prices[1])
-        by_account = -charges * by_circularity[0] * length
+        scale = env.network.objective.circularity_scale
+        by_circularity = np.full(env.num_envs, weight / (scale * count))
+        by_level = np.repeat(prices[:, None] / count, env.num_envs, axis=1)
+        by_account = -charges / (scale * env.num_envs)
         after = self._tape[-1][0].after
         stock, paths = np.zeros_like(after.stock), np.zeros_like(after.disturbances)
-        seen = np.zeros((max(span.stop for span in self._observed), env.num_envs))
+        seen = np.zeros((len(self._observed.rows), env.num_envs))
         gradients: list[list[Tensor]] = []
         for interval, values, slopes in reversed(self._tape):
             columns = np.minimum(interval.before.step, by_account.shape[1] - 1)
@@ -132,26 +210,14 @@ class GradientStack(ActorStack):
             stock, by_action, _ = self._derivatives.pull_back(interval, outputs, paths)
             gradients.insert(0, chain(weights.actor, values, self._by_output(by_action, values[-1])))
             by_input = gradients[0][0].cpu().numpy() * slopes
-            for rows, span in zip(by_input, self._observed, strict=True):
-                seen[span] = -FEEDBACK * rows[:, : span.stop - span.start].T
+            seen[self._observed.rows] = -FEEDBACK * self._observed.of(by_input)
         write_gradients(weights.actor, [values for _, values, _ in self._tape], gradients)
-        rate = self._models[0].lr_schedule(progress_remaining)
-        update_learning_rate(weights.optimiser, rate)
-        weights.clip(getattr(self._models[0], "max_grad_norm", LARGEST_NORM))
-        weights.optimiser.step()
-        weights.move_mean(MEAN_SHARE)
-        self._updates += 1
-        levels = after.service / length
-        self._move_prices(levels, self._amounts())
-        self._log(float(after.circularity.mean()) / length, levels.mean(axis=1), rate)
 
     def _by_output(self, by_action: Floats, outputs: Tensor) -> Tensor:
         """Return the loss's gradient by the outputs, shape (N, B, actions): minus that of what is maximised."""
-        gradient = np.zeros(outputs.shape, dtype=np.float32)
-        for rows, entries in zip(gradient, self._acted, strict=True):
-            rows[:, : entries.stop - entries.start] = -by_action[entries].T
-        beyond = outputs.cpu().numpy()
-        gradient[((beyond > 1.0) & (gradient < 0.0)) | ((beyond < -1.0) & (gradient > 0.0))] = 0.0
+        gradient, values = np.zeros(outputs.shape, dtype=np.float32), outputs.cpu().numpy()
+        gradient[self._acted.index] = -by_action[self._acted.rows]
+        gradient[(abs(values) > 1.0) & (gradient * values < 0.0)] = 0.0  # further out
         return torch.as_tensor(gradient, device=self._device)
 
     def _amounts(self) -> Floats:
@@ -168,21 +234,27 @@ class GradientStack(ActorStack):
 
         ``levels`` have shape (services, B), what is booked of budgets (B, budgets).
         """
-        run = self._run
-        if run.min_service is None:
+        run, min_service = self._run, self._run.min_service
+        if min_service is None:
             return
-
-        def step_prices(integrals: Floats, levels: Floats) -> tuple[Floats, Floats]:
-            doubt = 2.0 * QUANTILE_95 * levels.std(axis=1) / math.sqrt(run.episodes)
-            margin = np.maximum(doubt, MARGIN * (1.0 - min_service))
-            at_once = (integrals, levels.mean(axis=1) - margin, min_service, run.price_rate, run.price_damping)
-            return price_step(*at_once, least=LEAST_PRICE)
-
-        min_service = run.min_service
-        self._integrals, self._prices = step_prices(self._integrals, levels)
         if self._aims.budgets:
-            levels_of_budgets = budget_levels(self._aims, amounts, min_service)
-            self._budget_prices = step_prices(self._budget_prices[0], levels_of_budgets)
+            levels = np.concatenate([levels, budget_levels(self._aims, amounts, min_service)])
+        expected = levels.mean(axis=1) - self._variates.luck(self._draws(), levels.T)
+        doubt = 2.0 * QUANTILE_95 * levels.std(axis=1) / math.sqrt(run.episodes)
+        assured = expected - np.maximum(doubt, MARGIN * (1.0 - min_service))
+        integrals = np.concatenate([self._integrals, self._budget_prices[0]])
+        moved = price_step(integrals, assured, min_service, run.price_rate, run.price_damping, least=LEAST_PRICE)
+        services = len(self._integrals)
+        self._integrals, self._prices = (part[:services] for part in moved)
+        self._budget_prices = moved[0][services:], moved[1][services:]
+
+    def _draws(self) -> Floats:
+        """Return what was drawn for each copy, shape (B, draws): stocks, numbers, means of disturbances."""
+        before = self._tape[0][0].before
+        paths = before.disturbances[:-1]
+        means = paths.mean(axis=0) if len(paths) else before.factors[:0]
+        stocks = self._env.rows.stocks(before.stock)[self._drawn_stocks]
+        return np.concatenate([stocks, before.factors, means]).T
 
     def _log(self, circularity: float, levels: Floats, rate: float) -> None:
         """Log the figures of an update for each learner with a logger."""

@@ -20,9 +20,6 @@ from cirl_marl.network import Integers
 CELLS = 262_144
 """Hidden units times samples that are worked on at once on a CPU: few enough for its cache, many for each call."""
 
-MEAN = "mean"
-"""Running mean of a parameter, in the state of its optimiser."""
-
 
 def _tanh_(values: Tensor) -> Tensor:
     """Take the hyperbolic tangent in place; NumPy's is several times as fast as torch's on a CPU."""
@@ -309,10 +306,6 @@ class Weights:
         """Scale the gradient of each learner down to at most ``norm``, as torch's ``clip_grad_norm_`` does."""
         norms = torch.linalg.vector_norm(self.gradient, dim=1, keepdim=True)
         self.gradient.mul_((norm / (norms + 1e-6)).clamp(max=1.0))
-
-    def move_mean(self, share: float) -> None:
-        """Move the running mean of the parameters towards them; it is kept, given and taken as optimisers' states."""
-        self.optimiser.state[self.matrix].setdefault(MEAN, self.matrix.clone()).lerp_(self.matrix, share)
 
     def give(self) -> None:
         """Give each policy its parameters, and its optimiser its state."""

@@ -79,7 +79,7 @@ class StackedInputs:
     def observe(self, *, update_moments: bool) -> Tensor:
         """Return the present observations, shape (N, B, entries); ``update_moments`` has them count in the moments."""
         for i, learner in enumerate(self._members):
-            _enter(self._parts, i, learner.agent_env.reset())
+            _enter(self._parts, i, learner.agent_env.observation)
         if update_moments:
             for key in self._follows:
                 _update(self._moments[key], self._parts[key])
@@ -104,8 +104,11 @@ class StackedInputs:
 
     def rewards_and_dones(self) -> tuple[Tensor, NDArray[np.bool_]]:
         """Return the rewards as normalisers scale them, and which rows ended, shape (N, B) each."""
-        outcomes = [learner.agent_env.rewards_and_dones() for learner in self._members]
-        rewards, dones = (np.stack(parts) for parts in zip(*outcomes, strict=True))
+        rewards: NDArray[np.floating] = np.empty(self._returns.shape, dtype=np.float32)
+        dones = np.empty(rewards.shape, dtype=bool)
+        for i, learner in enumerate(self._members):
+            rewards[i], dones[i] = learner.agent_env.rewards, learner.agent_env.dones
+            learner.agent_env.centre(rewards[i])
         normaliser = self._members[0].normaliser
         if normaliser is not None:
             self._returns = self._returns * normaliser.gamma + rewards
@@ -179,7 +182,8 @@ def _enter(parts: Mapping[str, NDArray[np.floating]], i: int, observation: Any) 
 
 def _update(moments: RunningMeanStd, samples: NDArray[np.floating]) -> None:
     """Add samples, shape (N, samples, entries); their own moments are of their own precision."""
-    moments.update_from_moments(samples.mean(axis=1), samples.var(axis=1), samples.shape[1])
+    mean = samples.mean(axis=1)
+    moments.update_from_moments(mean, samples.var(axis=1, mean=mean[:, None]), samples.shape[1])
 
 
 class Stack(ABC):
