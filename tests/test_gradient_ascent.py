@@ -145,7 +145,7 @@ def test_actors_that_climbed_are_those_of_the_models(algorithm: str) -> None:
 
 
 @pytest.mark.parametrize("budgets", [{}, {"emissions": -50.0, "cost": 20.0}], ids=["services", "budgets"])
-def test_mending_makes_good_what_lacks(monkeypatch: pytest.MonkeyPatch, budgets: dict[str, float]) -> None:
+def test_a_repair_makes_good_what_lacks(monkeypatch: pytest.MonkeyPatch, budgets: dict[str, float]) -> None:
     """To first order: what lacks of levels and budgets in the coming episode; the environment stays where it is."""
     monkeypatch.setattr(gradient_ascent, "FEEDBACK", 1.0)
     asked = {"steps": 16, "evaluations": 1, "at_most": budgets, "price_rate": 0.1}
@@ -155,7 +155,7 @@ def test_mending_makes_good_what_lacks(monkeypatch: pytest.MonkeyPatch, budgets:
     assert isinstance(stack, GradientStack)
     lacks, excess = np.array([0.03, 0.01]), np.array([0.02, 0.0][: len(budgets)])
     before, end = stack._env.physical, stack.parameters
-    change = stack.mending(lacks, excess)
+    change = stack.repair(lacks, excess)
     assert stack._env.physical is before and torch.equal(stack.parameters, end)
 
     def lacking(share: float) -> float:

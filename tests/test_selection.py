@@ -68,11 +68,11 @@ def test_what_lacks_at_the_end_is_made_good_by_the_nearest(
     """Policies move up the gradient of what lacks as far as they must, and those act; a training itself ends alike."""
     seen: list[tuple[float, torch.Tensor, np.ndarray]] = []
     changes: list[torch.Tensor] = []
-    mending = GradientStack.mending
+    repair = GradientStack.repair
 
     def watch(stack: GradientStack, lacks: np.ndarray, excess: np.ndarray) -> torch.Tensor:
         np.testing.assert_allclose(lacks, [0.01])
-        changes.append(mending(stack, lacks, excess))
+        changes.append(repair(stack, lacks, excess))
         return changes[0]
 
     def score(env: MultiAgentVectorEnv, policies: StackedPolicies, aims: object) -> Score:
@@ -87,7 +87,7 @@ def test_what_lacks_at_the_end_is_made_good_by_the_nearest(
         return Score(-far, level, level, 0.0, {"copper_in_use": level})
 
     monkeypatch.setattr(trainer, "validation_score", score)
-    monkeypatch.setattr(GradientStack, "mending", watch)
+    monkeypatch.setattr(GradientStack, "repair", watch)
     climb = recipe(engine="gradients", min_service=0.99, steps=24, evaluations=2)
     options: dict[str, Any] = {"horizon": HORIZON, "circularity": "mean"}
     last = numbers(train("copper_net", climb, directory=tmp_path / "run", **options).learners["mine"].policy)

@@ -50,7 +50,7 @@ EVALUATION_COLUMNS = (
 """Columns of ``evaluations.csv``."""
 HALVINGS = 4
 """Policies that are tried between the last ones and those that serve."""
-LARGEST_MENDING = 256.0
+LARGEST_REPAIR = 256.0
 """How far they are looked for: so many times what would do to first order, which is little where clips bind."""
 COST = 0.02
 """Part of the time that checkpoints may take; they come less often if the last one took more."""
@@ -278,7 +278,7 @@ class Training:
         self._evaluate()
         self._bring_up_to_date()
         if self.run is not None:
-            self._mend()
+            self._repair()
             partial_folder = self.run.begin_checkpoint()
             for learner in self.learners.values():
                 learner.write_state(partial_folder, {}, last=True)
@@ -378,7 +378,7 @@ class Training:
         budgets = {budget.name: budget.most for budget in self._aims.budgets}
         return score.rank(self.config.recipe.run.min_service, budgets)
 
-    def _mend(self) -> None:
+    def _repair(self) -> None:
         """Where the last policies of exact gradients lack what is demanded, let the nearest act that do not.
 
         They are looked for up the gradient of what lacks, where it costs least.
@@ -391,10 +391,10 @@ class Training:
         excess = np.maximum(0.0, (amounts - self._aims.limits) / self._aims.sizes)
         stack = next(stack for stack in self._stacks if stack.members[0] in self.learners.values())
         assert isinstance(stack, GradientStack)
-        end, change, low, high = stack.parameters, stack.mending(lacks, excess), 0.0, 1.0
-        while high <= LARGEST_MENDING and not self._is_enough(stack, end + high * change):
+        end, change, low, high = stack.parameters, stack.repair(lacks, excess), 0.0, 1.0
+        while high <= LARGEST_REPAIR and not self._is_enough(stack, end + high * change):
             low, high = high, 4.0 * high
-        for _ in range(HALVINGS if high <= LARGEST_MENDING else 0):
+        for _ in range(HALVINGS if high <= LARGEST_REPAIR else 0):
             middle = (low + high) / 2
             low, high = (low, middle) if self._is_enough(stack, end + middle * change) else (middle, high)
         stack.parameters = end

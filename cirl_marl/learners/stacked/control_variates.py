@@ -27,15 +27,13 @@ class ControlVariates:
         """Begin anew, or from a ``state``."""
         self._count: int
         self._mean: Floats
-        self._draws: Floats
-        self._outcomes: Floats
-        fresh = (0, np.zeros(1), np.zeros((0, 0)), np.zeros((0, 0)))
-        self._count, self._mean, self._draws, self._outcomes = fresh if state is None else state
+        self._samples: tuple[Floats, Floats] | None
+        self._count, self._mean, self._samples = (0, np.zeros(1), None) if state is None else state
 
     @property
-    def state(self) -> tuple[int, Floats, Floats, Floats]:
+    def state(self) -> tuple[int, Floats, tuple[Floats, Floats] | None]:
         """All that it goes on from: number and mean of the draws so far, and the last draws and outcomes, centred."""
-        return self._count, self._mean, self._draws, self._outcomes
+        return self._count, self._mean, self._samples
 
     def luck(self, draws: Floats, outcomes: Floats) -> Floats:
         """Return by how much the mean of each outcome is above what other draws give, shape (outcomes,); learn from it.
@@ -44,22 +42,21 @@ class ControlVariates:
             draws: of each copy, shape (B, draws).
             outcomes: of its episode, shape (B, outcomes).
         """
-        count, mean = len(draws), draws.mean(axis=0)
-        self._count += count
-        self._mean = self._mean + (mean - self._mean) * (count / self._count)
-        centred = draws - mean, outcomes - outcomes.mean(axis=0)
-        if not len(self._draws):
-            self._draws, self._outcomes = (part[:0] for part in centred)
-        earlier = self._draws[-SAMPLES:], self._outcomes[-SAMPLES:]
-        self._draws, self._outcomes = (np.concatenate(parts)[-SAMPLES:] for parts in zip(earlier, centred, strict=True))
-        spread = self._draws.std(axis=0)
+        mean = draws.mean(axis=0)
+        self._count += len(draws)
+        self._mean = self._mean + (mean - self._mean) * (len(draws) / self._count)
+        x, y = draws - mean, outcomes - outcomes.mean(axis=0)
+        if self._samples is not None:
+            x, y = np.concatenate([self._samples[0], x]), np.concatenate([self._samples[1], y])
+        self._samples = x, y = x[-SAMPLES:], y[-SAMPLES:]
+        spread = x.std(axis=0)
         varies = spread > ROUNDING * np.abs(self._mean)
-        scaled, excess = self._draws[:, varies] / spread[varies], (mean - self._mean)[varies] / spread[varies]
-        samples, entries = scaled.shape
+        x, excess = x[:, varies] / spread[varies], (mean - self._mean)[varies] / spread[varies]
+        samples, entries = x.shape
         ridge = float(entries)  # draws/samples of each one's variance, summed over the samples
         if entries <= samples:
-            slopes = np.linalg.solve(scaled.T @ scaled + ridge * np.eye(entries), scaled.T @ self._outcomes)
+            slopes = np.linalg.solve(x.T @ x + ridge * np.eye(entries), x.T @ y)
         else:
-            slopes = scaled.T @ np.linalg.solve(scaled @ scaled.T + ridge * np.eye(samples), self._outcomes)
+            slopes = x.T @ np.linalg.solve(x @ x.T + ridge * np.eye(samples), y)
         luck: Floats = excess @ slopes
         return luck

@@ -65,9 +65,9 @@ class Places:
         members = np.repeat(np.arange(len(spans)), lengths)
         self.index = (members, slice(None), np.concatenate([np.arange(length) for length in lengths]))
 
-    def of(self, padded: NDArray[Any]) -> NDArray[Any]:
-        """Return entries of the padded array in the order of ``rows``, shape (rows, B)."""
-        return padded[self.index]
+    def of(self, array: NDArray[Any]) -> NDArray[Any]:
+        """Return entries of a padded array in the order of ``rows``, shape (rows, B)."""
+        return array[self.index]
 
 
 class GradientStack(ActorStack):
@@ -80,8 +80,8 @@ class GradientStack(ActorStack):
         self._derivatives, self._run = Derivatives(self._env), run
         # where the entries of each agent's observation and action stand in the stacks of all
         names = [member.name for member in members]
-        self._observed = Places([self._env.layout.slices[name] for name in names])
-        self._acted = Places([self._env.actuators.entries[name] for name in names])
+        self._observation_places = Places([self._env.layout.slices[name] for name in names])
+        self._action_places = Places([self._env.actuators.entries[name] for name in names])
         first, weight = self._models[0], max(self._env.circularity_weight, 1e-6)
         stated = np.array([service.weight for service in self._env.network.services]) * (1.0 - weight) / weight
         self._prices: Floats = getattr(first, "service_prices", stated)
@@ -135,7 +135,7 @@ class GradientStack(ActorStack):
     def _advance(self, outputs: Tensor) -> None:
         """Move the environment itself by what policies put out."""
         actions = np.empty((len(self._env.actuators.control_rows), self._env.num_envs))
-        actions[self._acted.rows] = np.clip(self._acted.of(outputs.cpu().numpy()), -1.0, 1.0)
+        actions[self._action_places.rows] = np.clip(self._action_places.of(outputs.cpu().numpy()), -1.0, 1.0)
         self._env.advance(actions)
 
     def _look_ahead(self) -> None:
@@ -176,7 +176,7 @@ class GradientStack(ActorStack):
         self._weights.matrix.copy_(matrix)
         self._give_models()
 
-    def mending(self, lacks: Floats, excess: Floats) -> Tensor:
+    def repair(self, lacks: Floats, excess: Floats) -> Tensor:
         """Return a change of all parameters after which, to first order, nothing lacks in the coming episode.
 
         It leads up the gradient of what lacks. Where policies are the best for some price this is a cheapest way: it
@@ -189,8 +189,8 @@ class GradientStack(ActorStack):
         self._look_ahead()
         self._write_gradient(0.0, lacks, charges_of(self._env, self._aims, excess))
         gradient = self._weights.gradient
-        wanted, slope = float(lacks @ lacks + excess @ excess), float(gradient.square().sum())
-        return gradient * (-wanted / slope if slope > 0.0 else 0.0)
+        amount, slope = float(lacks @ lacks + excess @ excess), float(gradient.square().sum())
+        return gradient * (-amount / slope if slope > 0.0 else 0.0)
 
     def _write_gradient(self, weight: float, prices: Floats, charges: Floats) -> None:
         """Go back through the episode; ``weight`` is that of circularity, ``charges`` are by account."""
@@ -202,7 +202,7 @@ class GradientStack(ActorStack):
         by_account = -charges / (scale * env.num_envs)
         after = self._tape[-1][0].after
         stock, paths = np.zeros_like(after.stock), np.zeros_like(after.disturbances)
-        seen = np.zeros((len(self._observed.rows), env.num_envs))
+        seen = np.zeros((len(self._observation_places.rows), env.num_envs))
         gradients: list[list[Tensor]] = []
         for interval, values, slopes in reversed(self._tape):
             columns = np.minimum(interval.before.step, by_account.shape[1] - 1)
@@ -210,13 +210,13 @@ class GradientStack(ActorStack):
             stock, by_action, _ = self._derivatives.pull_back(interval, outputs, paths)
             gradients.insert(0, chain(weights.actor, values, self._by_output(by_action, values[-1])))
             by_input = gradients[0][0].cpu().numpy() * slopes
-            seen[self._observed.rows] = -FEEDBACK * self._observed.of(by_input)
+            seen[self._observation_places.rows] = -FEEDBACK * self._observation_places.of(by_input)
         write_gradients(weights.actor, [values for _, values, _ in self._tape], gradients)
 
     def _by_output(self, by_action: Floats, outputs: Tensor) -> Tensor:
         """Return the loss's gradient by the outputs, shape (N, B, actions): minus that of what is maximised."""
         gradient, values = np.zeros(outputs.shape, dtype=np.float32), outputs.cpu().numpy()
-        gradient[self._acted.index] = -by_action[self._acted.rows]
+        gradient[self._action_places.index] = -by_action[self._action_places.rows]
         gradient[(abs(values) > 1.0) & (gradient * values < 0.0)] = 0.0  # further out
         return torch.as_tensor(gradient, device=self._device)
 
@@ -239,14 +239,14 @@ class GradientStack(ActorStack):
             return
         if self._aims.budgets:
             levels = np.concatenate([levels, budget_levels(self._aims, amounts, min_service)])
-        expected = levels.mean(axis=1) - self._variates.luck(self._draws(), levels.T)
+        means = levels.mean(axis=1) - self._variates.luck(self._draws(), levels.T)
         doubt = 2.0 * QUANTILE_95 * levels.std(axis=1) / math.sqrt(run.episodes)
-        assured = expected - np.maximum(doubt, MARGIN * (1.0 - min_service))
+        lower_bounds = means - np.maximum(doubt, MARGIN * (1.0 - min_service))
         integrals = np.concatenate([self._integrals, self._budget_prices[0]])
-        moved = price_step(integrals, assured, min_service, run.price_rate, run.price_damping, least=LEAST_PRICE)
+        both = price_step(integrals, lower_bounds, min_service, run.price_rate, run.price_damping, least=LEAST_PRICE)
         services = len(self._integrals)
-        self._integrals, self._prices = (part[:services] for part in moved)
-        self._budget_prices = moved[0][services:], moved[1][services:]
+        self._integrals, self._prices = (part[:services] for part in both)
+        self._budget_prices = both[0][services:], both[1][services:]
 
     def _draws(self) -> Floats:
         """Return what was drawn for each copy, shape (B, draws): stocks, numbers, means of disturbances."""
