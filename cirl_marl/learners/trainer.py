@@ -48,10 +48,11 @@ EVALUATION_COLUMNS = (
     "joint_step", "env_steps", "circularity", "service", "assured", "paid", "circularity_weight", "best",
 )  # fmt: skip
 """Columns of ``evaluations.csv``."""
+EXTENSIONS, LONGEST = 6, 16.0
+"""Policies that are tried beyond the last ones until nothing lacks, each at most so many times as far as the one
+before: slopes promise too much where clips bind."""
 HALVINGS = 4
-"""Policies that are tried between the last ones and those that serve."""
-LARGEST_REPAIR = 256.0
-"""How far they are looked for: so many times what would do to first order, which is little where clips bind."""
+"""Policies that are tried between the last that lacked something and the first that did not."""
 COST = 0.02
 """Part of the time that checkpoints may take; they come less often if the last one took more."""
 
@@ -391,21 +392,26 @@ class Training:
         excess = np.maximum(0.0, (amounts - self._aims.limits) / self._aims.sizes)
         stack = next(stack for stack in self._stacks if stack.members[0] in self.learners.values())
         assert isinstance(stack, GradientStack)
-        end, change, low, high = stack.parameters, stack.repair(lacks, excess), 0.0, 1.0
-        while high <= LARGEST_REPAIR and not self._is_enough(stack, end + high * change):
-            low, high = high, 4.0 * high
-        for _ in range(HALVINGS if high <= LARGEST_REPAIR else 0):
+        end, change = stack.parameters, stack.repair(lacks, excess)
+        (is_enough, first), low, high = self._rank(last), 0.0, 1.0
+        for _ in range(EXTENSIONS):
+            is_enough, least = self._rank_of(stack, end + high * change)
+            if is_enough:
+                break
+            share = (least - first) / (settings.min_service - first)  # of what lacks
+            low, high = high, high * min(max(2.0, 1.5 / share), LONGEST) if share > 0.0 else LONGEST * high
+        for _ in range(HALVINGS if is_enough else 0):
             middle = (low + high) / 2
-            low, high = (low, middle) if self._is_enough(stack, end + middle * change) else (middle, high)
+            low, high = (low, middle) if self._rank_of(stack, end + middle * change)[0] else (middle, high)
         stack.parameters = end
 
-    def _is_enough(self, stack: GradientStack, parameters: Tensor) -> bool:
-        """Validate policies with these parameters, keep them if they are the best, and return whether nothing lacks."""
+    def _rank_of(self, stack: GradientStack, parameters: Tensor) -> Rank:
+        """Validate policies with these parameters, keep them if they are the best, and return their rank."""
         assert self._validation_env is not None
         stack.parameters = parameters
         score = validation_score(self._validation_env, StackedPolicies(self.learners, [stack]), self._aims)
         self._keep_if_best(score)
-        return self._rank(score)[0]
+        return self._rank(score)
 
     def _write_policies(self, folder: Path) -> None:
         for learner in self.learners.values():
