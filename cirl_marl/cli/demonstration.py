@@ -14,7 +14,7 @@ from cirl_marl.cli.common import LEARNERS, app, folder_for, say, training_bar
 from cirl_marl.cli.learning import evaluate_and_draw, what_is_kept
 from cirl_marl.errors import CirlError
 
-NETWORK, RECIPE, STEPS = "copper_net", "exact_gradients", 768_000
+NETWORK, RECIPE, STEPS = "copper_net", "exact_gradients", 600_000
 COMPARISON_EPISODES = 16
 """Episodes in which the team is held against the bound."""
 PAGE = "report.html"
