@@ -145,27 +145,29 @@ def test_actors_that_climbed_are_those_of_the_models(algorithm: str) -> None:
 
 
 @pytest.mark.parametrize("budgets", [{}, {"emissions": -50.0, "cost": 20.0}], ids=["services", "budgets"])
-def test_a_repair_makes_good_what_lacks(monkeypatch: pytest.MonkeyPatch, budgets: dict[str, float]) -> None:
-    """To first order: what lacks of levels and budgets in the coming episode; the environment stays where it is."""
+def test_slopes_are_those_of_what_is_demanded(monkeypatch: pytest.MonkeyPatch, budgets: dict[str, float]) -> None:
+    """Of each level and of minus each budget in parts of it, in the coming episode; the environment stays as it is."""
     monkeypatch.setattr(gradient_ascent, "FEEDBACK", 1.0)
     asked = {"steps": 16, "evaluations": 1, "at_most": budgets, "price_rate": 0.1}
     climb = recipe(asked, parameters={**PARAMETERS, "learning_rate": 1e-3})
     training = train(booked(load_network("carbo_net"), 2, efforts=False), climb, seed=4)
     (stack,) = training._stacks
     assert isinstance(stack, GradientStack)
-    lacks, excess = np.array([0.03, 0.01]), np.array([0.02, 0.0][: len(budgets)])
-    before, end = stack._env.physical, stack.parameters
-    change = stack.repair(lacks, excess)
+    before, end, slopes = stack._env.physical, stack.parameters, stack.slopes()
     assert stack._env.physical is before and torch.equal(stack.parameters, end)
 
-    def lacking(share: float) -> float:
-        stack.parameters = end + share * change
+    def outcomes(change: np.ndarray) -> np.ndarray:
+        stack.parameters = end + torch.as_tensor(change, dtype=torch.float32).view_as(end)
         stack._look_ahead()
         levels = stack._tape[-1][0].after.service.mean(axis=1) / len(stack._tape)
-        return float(lacks @ levels - excess @ (stack._amounts().mean(axis=0) / stack._aims.sizes))
+        return np.append(levels, -stack._amounts().mean(axis=0) / stack._aims.sizes)
 
-    slope = (lacking(0.01) - lacking(-0.01)) / 0.02
-    assert slope == pytest.approx(lacks @ lacks + excess @ excess, rel=0.02)
+    assert len(slopes) == 2 + len(budgets)
+    for row in slopes:
+        change = 1e-3 * row / max(1e-9, np.linalg.norm(row))
+        expected = slopes @ change
+        rise = (outcomes(change) - outcomes(-change)) / 2
+        np.testing.assert_allclose(rise, expected, atol=0.02 * np.abs(expected).max())
 
 
 def test_each_service_has_a_price(monkeypatch: pytest.MonkeyPatch) -> None:

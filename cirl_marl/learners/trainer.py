@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
 import time
@@ -15,8 +16,8 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 from stable_baselines3.common.callbacks import BaseCallback
-from torch import Tensor
 
 from cirl_marl.environments.rewards import CIRCULARITY_REWARDS
 from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
@@ -32,6 +33,7 @@ from cirl_marl.learners.stacked.gradient_ascent import GradientStack
 from cirl_marl.learners.stacked.stack import Stack, StackedPolicies
 from cirl_marl.learners.start import begin_again, begin_from
 from cirl_marl.learners.validation import Multipliers, Rank, Score, validation_score
+from cirl_marl.network import Floats
 from cirl_marl.network.declarations import positional_record
 from cirl_marl.network.elements import CIRCULARITY
 from cirl_marl.optimum.aims import aims_of
@@ -48,11 +50,12 @@ EVALUATION_COLUMNS = (
     "joint_step", "env_steps", "circularity", "service", "assured", "paid", "circularity_weight", "best",
 )  # fmt: skip
 """Columns of ``evaluations.csv``."""
-EXTENSIONS, LONGEST = 6, 16.0
-"""Policies that are tried beyond the last ones until nothing lacks, each at most so many times as far as the one
-before: slopes promise too much where clips bind."""
-HALVINGS = 4
-"""Policies that are tried between the last that lacked something and the first that did not."""
+REPAIRS, LONGEST = 10, 16.0
+"""Policies that are tried near the last ones, each step at most so many times as long as the one before."""
+CUSHION = 0.05
+"""Part of what lacks most by which they are to keep more than is demanded."""
+RIDGE = 1e-9
+"""Part of the largest response below which another counts as none."""
 COST = 0.02
 """Part of the time that checkpoints may take; they come less often if the last one took more."""
 
@@ -382,36 +385,42 @@ class Training:
     def _repair(self) -> None:
         """Where the last policies of exact gradients lack what is demanded, let the nearest act that do not.
 
-        They are looked for up the gradient of what lacks, where it costs least.
+        Policies move up the slopes G of what is demanded, by θ + Gᵀ w: where they are the best for some prices, these
+        are what it costs. How outcomes respond to w is first G Gᵀ, then what validations show (Broyden 1965, A class of
+        methods for solving nonlinear simultaneous equations).
         """
         last, settings = self._last_score, self.config.recipe.run
         if settings.engine != "gradients" or last is None or settings.min_service is None or self._rank(last)[0]:
             return
-        lacks = np.maximum(0.0, settings.min_service - np.array([*last.levels.values()]))
-        amounts = np.array([last.accounts[budget.name] for budget in self._aims.budgets])
-        excess = np.maximum(0.0, (amounts - self._aims.limits) / self._aims.sizes)
         stack = next(stack for stack in self._stacks if stack.members[0] in self.learners.values())
         assert isinstance(stack, GradientStack)
-        end, change = stack.parameters, stack.repair(lacks, excess)
-        (is_enough, first), low, high = self._rank(last), 0.0, 1.0
-        for _ in range(EXTENSIONS):
-            is_enough, least = self._rank_of(stack, end + high * change)
-            if is_enough:
+        end, slopes = stack.parameters, stack.slopes()
+        gram, margins = slopes @ slopes.T, self._margins(last)
+        weights, response, cushion = np.zeros(len(gram)), gram, -CUSHION * float(margins.min())
+        length = math.inf
+        for _ in range(REPAIRS):
+            goal = least_weights(gram, response, response @ weights + cushion - margins)
+            step = goal - weights
+            if not (size := float(np.linalg.norm(step))):
                 break
-            share = (least - first) / (settings.min_service - first)  # of what lacks
-            low, high = high, high * min(max(2.0, 1.5 / share), LONGEST) if share > 0.0 else LONGEST * high
-        for _ in range(HALVINGS if is_enough else 0):
-            middle = (low + high) / 2
-            low, high = (low, middle) if self._rank_of(stack, end + middle * change)[0] else (middle, high)
+            step *= min(1.0, LONGEST * length / size)
+            length = float(np.linalg.norm(step))
+            weights = weights + step
+            stack.parameters = end + torch.as_tensor(weights @ slopes, dtype=end.dtype, device=end.device).view_as(end)
+            assert self._validation_env is not None
+            score = validation_score(self._validation_env, StackedPolicies(self.learners, [stack]), self._aims)
+            self._keep_if_best(score)
+            change, margins = self._margins(score) - margins, self._margins(score)
+            response = response + np.outer(change - response @ step, step) / length**2
+            if self._rank(score)[0] and margins.min() <= 2.0 * cushion:
+                break
         stack.parameters = end
 
-    def _rank_of(self, stack: GradientStack, parameters: Tensor) -> Rank:
-        """Validate policies with these parameters, keep them if they are the best, and return their rank."""
-        assert self._validation_env is not None
-        stack.parameters = parameters
-        score = validation_score(self._validation_env, StackedPolicies(self.learners, [stack]), self._aims)
-        self._keep_if_best(score)
-        return self._rank(score)
+    def _margins(self, score: Score) -> Floats:
+        """Return by how much each level is kept, and each budget in parts of it, shape (services + budgets,)."""
+        amounts = np.array([score.accounts[budget.name] for budget in self._aims.budgets])
+        levels = np.array([*score.levels.values()]) - self.config.recipe.run.min_service
+        return np.concatenate([levels, (self._aims.limits - amounts) / self._aims.sizes])
 
     def _write_policies(self, folder: Path) -> None:
         for learner in self.learners.values():
@@ -435,6 +444,19 @@ class Training:
                 before, now = ("stacked", "by itself") if learner.was_in_stack else ("by itself", "stacked")
                 title = learner.agent_env.title
                 raise RunError(f"{title} learnt {before} and would go on {now}: give the same callbacks")
+
+
+def least_weights(gram: Floats, response: Floats, needs: Floats) -> Floats:
+    """Return the least w of those with R w ≥ ``needs``: min ½ wᵀ K w by its dual, w = K⁻¹ Rᵀ μ with μ ≥ 0.
+
+    K is ``gram``, R ``response``, both of shape (n, n); zero where nothing responds.
+    """
+    ridge = np.eye(len(gram)) * RIDGE
+    ways = np.linalg.solve(gram + ridge * (gram.max() or 1.0), response.T)
+    dual = response @ ways
+    root = np.linalg.cholesky((dual + dual.T) / 2 + ridge * (dual.max() or 1.0))
+    weights: Floats = ways @ nnls(root.T, np.linalg.solve(root, needs))[0]
+    return weights
 
 
 def run_together(

@@ -176,21 +176,18 @@ class GradientStack(ActorStack):
         self._weights.matrix.copy_(matrix)
         self._give_models()
 
-    def repair(self, lacks: Floats, excess: Floats) -> Tensor:
-        """Return a change of all parameters after which, to first order, nothing lacks in the coming episode.
+    def slopes(self) -> Floats:
+        """Return gradients by all parameters of how the coming episode keeps what is demanded.
 
-        It leads up the gradient of what lacks. Where policies are the best for some price this is a cheapest way: it
-        costs that price.
-
-        Args:
-            lacks: of the level of each service, shape (services,).
-            excess: of each budget, in parts of it, shape (budgets,).
+        Rows are of the level of each service and of minus each budget's total in parts of it, shape (services +
+        budgets, learners · parameters).
         """
         self._look_ahead()
-        self._write_gradient(0.0, lacks, charges_of(self._env, self._aims, excess))
-        gradient = self._weights.gradient
-        amount, slope = float(lacks @ lacks + excess @ excess), float(gradient.square().sum())
-        return gradient * (-amount / slope if slope > 0.0 else 0.0)
+        services, rows = len(self._prices), list[Floats]()
+        for unit in np.eye(services + len(self._aims.budgets)):
+            self._write_gradient(0.0, unit[:services], charges_of(self._env, self._aims, unit[services:]))
+            rows.append(-self._weights.gradient.flatten().double().cpu().numpy())
+        return np.stack(rows)
 
     def _write_gradient(self, weight: float, prices: Floats, charges: Floats) -> None:
         """Go back through the episode; ``weight`` is that of circularity, ``charges`` are by account."""
