@@ -170,6 +170,20 @@ def test_slopes_are_those_of_what_is_demanded(monkeypatch: pytest.MonkeyPatch, b
         np.testing.assert_allclose(rise, expected, atol=0.02 * np.abs(expected).max())
 
 
+def test_beyond_its_bounds_only_what_leads_back_counts() -> None:
+    """An output beyond 1 gets no gradient further out, and all of one back, as if it were not clipped; padding none."""
+    (stack,) = train("copper_net", recipe({"steps": 8}))._stacks
+    assert isinstance(stack, GradientStack)
+    count = len(stack._env.actuators.control_rows)
+    shape = (len(stack.members), stack._env.num_envs, max(space.shape[0] for space in stack._inputs.spaces))
+    for value, out in ((1.5, 1.0), (-1.5, -1.0), (0.5, 0.0)):
+        for worth in (1.0, -1.0):
+            gradient = stack._by_output(np.full((count, shape[1]), worth), torch.full(shape, value)).numpy()
+            found = gradient[stack._action_places.index]
+            np.testing.assert_array_equal(found, np.zeros_like(found) if worth == out else -worth * np.ones_like(found))
+            assert np.abs(gradient).sum() == np.abs(found).sum()
+
+
 def test_each_service_has_a_price(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its logarithm moves by what an evaluation would lack of it, and what follows is paid at that price."""
     move, errors, variates = GradientStack._move_prices, list[np.ndarray](), ControlVariates()
