@@ -455,7 +455,7 @@ def least_weights(gram: Floats, response: Floats, needs: Floats) -> Floats:
     ways = np.linalg.solve(gram + ridge * (gram.max() or 1.0), response.T)
     dual = response @ ways
     root = np.linalg.cholesky((dual + dual.T) / 2 + ridge * (dual.max() or 1.0))
-    weights: Floats = ways @ nnls(root.T, np.linalg.solve(root, needs))[0]
+    weights: Floats = ways @ nnls(root.T, np.linalg.solve(root, needs), maxiter=1000)[0]
     return weights
 
 
