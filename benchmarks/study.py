@@ -166,6 +166,8 @@ def main(
     trial = bool(steps) or (seeds, episodes) != (SEEDS, EPISODES)
     folder = write or (out / "trial" if trial else DOCUMENT.parent)
     results = RESULTS if folder == DOCUMENT.parent else folder / "results"
+    if results == RESULTS and out.is_absolute():
+        raise CirlError(f"--out {out}: results name it; give one relative to the project")
     document, pictures = folder / DOCUMENT.name, folder / "pictures"
     pictures.mkdir(parents=True, exist_ok=True)
     if not document.exists():

@@ -22,6 +22,7 @@ from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.lqr import LinearSystem
 from cirl_marl.controllers.rollout import first_seed, rollout
 from cirl_marl.environments.state import Interval
+from cirl_marl.errors import CirlError
 from cirl_marl.jobs import run_jobs
 from cirl_marl.network import Floats
 from cirl_marl.optimum import Sampling
@@ -200,6 +201,8 @@ def test_kept_results_name_no_machine() -> None:
     absolute = re.compile(r"""(?<![^\s"',=])/\w[\w.-]*/""")
     assert [path.name for path in kept if absolute.search(path.read_text(encoding="utf-8"))] == []
     assert absolute.search('"/home/somebody/runs"')
+    with pytest.raises(CirlError, match="relative to the project"):
+        study.main(out=Path("/home/somebody/runs"), table=True)
 
 
 def test_exact_slopes_are_of_discounted_rewards() -> None:
