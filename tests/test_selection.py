@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from small_networks import ACCOUNTS, booked
 
@@ -127,6 +127,31 @@ def test_least_weights(seed: int, count: int) -> None:
         if (response @ other >= needs).all():
             assert other @ gram @ other >= least @ gram @ least - 1e-5 * (1.0 + np.abs(least).max() ** 2)
     assert not trainer.least_weights(np.zeros((2, 2)), np.zeros((2, 2)), np.ones(2)).any()
+
+
+@given(st.integers(0, 10**6))
+@example(161)
+@example(1863)
+@example(6251)
+def test_many_demands_alike(seed: int) -> None:
+    """Thirty demands, many of which ask for the same or for nothing, have their weights in every trial."""
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(6, 31))
+    rank = int(rng.integers(1, count + 1))
+    slopes = rng.normal(size=(count, rank)) @ rng.normal(size=(rank, 200))
+    slopes *= 10.0 ** rng.integers(-6, 1, size=(count, 1))
+    slopes[rng.random(count) < 0.3] = 0
+    gram = slopes @ slopes.T
+    response, truth = gram.copy(), rng.uniform(-0.5, 1, size=gram.shape) * gram
+    needs, weights = rng.random(count) * 10.0 ** rng.integers(-6, 0), np.zeros(count)
+    for _ in range(6):
+        step = trainer.least_weights(gram, response, response @ weights + needs) - weights
+        assert np.isfinite(step).all()
+        if not step.any():
+            return
+        change = truth @ step + 1e-5 * rng.normal(size=count)
+        weights, needs = weights + step, needs - change
+        response = response + np.outer(change - response @ step, step) / (step @ step)
 
 
 @pytest.mark.parametrize(("engine", "share"), [("lockstep", 0.5), ("stacked", 1.0), ("gradients", 0.5)])
