@@ -670,3 +670,19 @@ def test_near_bound_is_where_the_solver_starts() -> None:
         found = bound("carbo_net", min_service=0.95, horizon=12, near=near)
         assert found.objective == pytest.approx(alone.objective, rel=1e-6)
         assert found.verify().bound == found.objective
+
+
+def test_near_bound_of_another_degree_is_of_the_same_program() -> None:
+    """What a network can reach is not found twice, and the program is the same as without; of other agents it is."""
+    network = load_network("car_batteries").with_options(episode={"horizon": 4})
+    near = bound(network, min_service=0.5)
+    found = bound(network, min_service=0.6, degree=3, tight=True, near=near)
+    alone = bound(network, min_service=0.6, degree=3, tight=True)
+    assert found.problem.system is near.problem.system
+    for name in ("cost", "equal", "equal_to", "under", "under_to", "low", "high"):
+        mine, theirs = (getattr(each.problem, name) for each in (found, alone))
+        np.testing.assert_array_equal(*(x.toarray() if sparse.issparse(x) else x for x in (mine, theirs)))
+    assert found.objective == alone.objective
+    few = bound(network, agents=network.default_agents[:1], near=near)
+    assert few.problem.system is not near.problem.system
+    assert few.objective == pytest.approx(bound(network, agents=network.default_agents[:1]).objective, rel=1e-6)

@@ -260,7 +260,8 @@ def bound(
         degree: degree of the test polynomials, 1 or more; higher is tighter and slower.
         tight: whether flows that may vary within an interval, such as what leaves lifetimes, have constant parts, so
             that shares of them cannot change: mostly tighter where there are lifetimes, and somewhat slower.
-        near: a bound of a similar program, from whose solution this one is reached sooner: another start or level.
+        near: a bound of a similar program, from whose solution this one is reached sooner: another start or level. Of
+            the same network with another degree what it can reach is taken over.
         uncertain: whether disturbances and uncertain numbers are drawn, and how if not by default; excludes
             ``service_weight``, ``near``, ``tight`` and ``aim``.
         progress: with ``uncertain``, which takes minutes, called with the share that is done.
@@ -288,8 +289,12 @@ def bound(
     admissible = Admissible.of(definition, agents)
     start = starting_stocks(admissible.lifetimes, initial)
     levels = None if min_service is None else demanded_levels(admissible.network, min_service)
-    basis = None if near is None else near.basis
-    programs = Programs(admissible, degree, service_weight, steady_parts=tight)
+    basis = system = None
+    if near is not None and (near.degree, near.tight) == (degree, tight):
+        basis = near.basis
+    if near is not None and (near.network, near.agents) == (admissible.lifetimes.network, admissible.agents):
+        system = near.problem.system
+    programs = Programs(admissible, degree, service_weight, steady_parts=tight, system=system)
     return _solve_bound(programs, start, service_weight, levels, basis, aims)
 
 

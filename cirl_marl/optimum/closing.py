@@ -86,6 +86,7 @@ def close_gap(
         bound_start = clock()
         try:
             solution = bound(network, min_service=min_service, degree=degree, tight=True, **options)
+            options["near"] = solution
         except CirlError:
             if tightest is None:
                 raise
