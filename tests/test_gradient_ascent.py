@@ -39,6 +39,46 @@ def recipe(run: dict[str, Any] | None = None, **learner: Any) -> Recipe:
     )
 
 
+def test_gradients_that_grow_are_taken_with_less_feedback(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where policies are steep, half of it does, or none; where the objective is dear, less of it is of no use."""
+    climb, go_back, passes = GradientStack._climb, GradientStack._go_back, list[float]()
+
+    def watch(stack: GradientStack, weight: float, prices: Any, charges: Any, feedback: float) -> None:
+        passes.append(feedback)
+        go_back(stack, weight, prices, charges, feedback)
+
+    def gradient(stack: GradientStack, weight: float, feedback: float | None = None) -> Any:
+        passes.clear()
+        arguments = weight, weight * stack._prices, weight * stack._charges[:, None]
+        stack._write_gradient(*arguments) if feedback is None else stack._go_back(*arguments, feedback)
+        return stack._weights.gradient.clone()
+
+    def check(stack: GradientStack, progress_remaining: float) -> None:
+        assert (gradient(stack, 1.0) == gradient(stack, 1.0, 0.5)).all()
+        monkeypatch.setattr(gradient_ascent, "FEEDBACK", 1e6)
+        halved = gradient(stack, 1.0)
+        assert len(passes) > 5
+        assert passes == [1e6 / 2**i for i in range(len(passes))]
+        assert gradient_ascent.GROWN / 100 < torch.linalg.vector_norm(halved, dim=1).max() <= gradient_ascent.GROWN
+        monkeypatch.setattr(gradient_ascent, "FEEDBACK", 1e30)  # beyond all numbers
+        monkeypatch.setattr(gradient_ascent, "LEAST_FEEDBACK", 1e29)
+        alone = gradient(stack, 1.0)
+        assert passes[-1] == 0.0
+        assert len(passes) == 6
+        assert (alone == gradient(stack, 1.0, 0.0)).all()
+        for name, value in (("FEEDBACK", 0.5), ("LEAST_FEEDBACK", 0.01)):
+            monkeypatch.setattr(gradient_ascent, name, value)
+        gradient(stack, 1e9)
+        assert passes == [0.5, 0.25]
+        climb(stack, progress_remaining)
+
+    monkeypatch.setattr(GradientStack, "_go_back", watch)
+    monkeypatch.setattr(GradientStack, "_climb", check)
+    steep = {**PARAMETERS, "policy_kwargs": {"net_arch": [4], "ortho_init": False}}
+    train("copper_net", recipe({"steps": 8}, parameters=steep))
+    assert passes
+
+
 @pytest.mark.parametrize(
     ("share", "budgets", "algorithm"),
     [(1.0, {}, "PPO"), (0.5, {"emissions": -50.0, "cost": 20.0}, "PPO"), *((1.0, {}, name) for name in SQUASHED)],
