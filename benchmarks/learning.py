@@ -34,7 +34,7 @@ from cirl_marl.records.files import write_json
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "study.md"
 RESULTS = Path(__file__).parent / "results" / "learning.json"
-RECIPE, FIRST_SEED, NETWORKS = "exact_gradients", 700, 10
+RECIPE, FIRST_SEED, NETWORKS = "exact_gradients", 2000, 10
 """No tuning looked at networks of the first seed or later ones."""
 TERMS = 25
 """Most terms of the solver's series in a decision."""
@@ -68,7 +68,7 @@ def fitting(first: int) -> Iterator[tuple[int, Network]]:
 def measured(seed: int, network: Network, recipe: str) -> dict[str, Any]:
     """Train, and return what the acting checkpoint reaches."""
     begun = time.process_time()
-    with TemporaryDirectory() as folder:  # as users train: policies of kept runs are averaged at the end
+    with TemporaryDirectory() as folder:  # as users train: what a kept run lacks at the end is made good
         training = train(network, recipe, seed=1, directory=Path(folder) / "run")
     seconds, score = time.process_time() - begun, training.best
     demanded = training.config.recipe.run.min_service
