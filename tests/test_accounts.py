@@ -433,6 +433,7 @@ def test_uncertain_and_disturbed_prices_are_each_copy_s_own() -> None:
     np.testing.assert_allclose(again.sum(axis=(1, 2)), run.accounts[0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_command_line_writes_and_plans(tmp_path: Path) -> None:
     """``simulate`` says totals and writes who books what; ``plan`` keeps costs low under a budget."""
     file = tmp_path / "city.toml"

@@ -120,6 +120,7 @@ def test_what_a_band_cannot_keep_is_said() -> None:
     assert f"this one has {0.9 - run.episode_levels[0, 0]:.4f} less of 'product'" in controller.note
 
 
+@pytest.mark.sample(4)
 @pytest.mark.parametrize("order", [300.0, 420.0, 900.0])
 @pytest.mark.parametrize("kept", [0.5, 0.79, 0.83])
 def test_orders_that_are_cut_do_not_stop_a_plan(order: float, kept: float) -> None:

@@ -416,6 +416,7 @@ def test_solver_that_fails(
     assert "service" in said
 
 
+@pytest.mark.slow
 def test_terminals_that_write_no_greek() -> None:
     """In a locale without λ it becomes a question mark; without any output the exit code says it all."""
     bottles()

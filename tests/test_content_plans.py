@@ -320,7 +320,7 @@ def booked() -> Network:
         ({"aim": "ore", "at_most": {"scrap": 12.0}}, 24.0, 12.0),
     ],
 )
-@pytest.mark.sample(2)
+@pytest.mark.sample(1)
 def test_mpc_keeps_budgets_and_aims_beside_contents(options: dict[str, Any], ore: float, scrap: float) -> None:
     """Of 6 t a year half may be scrap by its copper, less where it is dear or there is little of it."""
     run = controlled_by_mpc(booked(), demanded=1.0, **options)

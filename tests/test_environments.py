@@ -59,7 +59,7 @@ def marked(test: Callable[..., None]) -> Callable[..., None]:
 
 
 @pytest.mark.medium
-@pytest.mark.sample(12)
+@pytest.mark.sample(8)
 @anything
 @pytest.mark.parametrize(("observe", "horizon"), [(None, None), ("local", 12), ("full", 12)])
 def test_catalogue_conforms(name: str, scenario: str, observe: str | None, horizon: int | None) -> None:
@@ -84,7 +84,7 @@ def test_pettingzoos_own_tests(name: str, scenario: str, capsys: pytest.CaptureF
 
 @marked
 @anything
-@pytest.mark.sample(15)
+@pytest.mark.sample(10)
 def test_gymnasium_and_sb3_checkers(name: str, scenario: str) -> None:
     """The one-agent view, under both checkers."""
     from gymnasium.utils.env_checker import check_env as gymnasium_check

@@ -33,7 +33,7 @@ def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     table.ids.cache_clear()
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_the_table_is_that_of_the_catalogue() -> None:
     """Every network, scenario and environment of the paper has one id, and there is no other."""
     assert sorted(table.ids()) == sorted(names()), "run python tests/environment_ids.py"

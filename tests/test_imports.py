@@ -58,7 +58,7 @@ def test_imports_go_one_way() -> None:
 
 
 @pytest.mark.sample(1)
-@pytest.mark.medium
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "line"),
     [

@@ -113,6 +113,7 @@ def assert_batch_is_lone(network: Network, seed: int, reward: str) -> None:
 
 
 @pytest.mark.medium
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("networks", [any_network, substances_networks, batch_networks])
 @given(data=st.data(), seed=st.integers(0, 2**31), reward=st.sampled_from(REWARDS))
 def test_random_batch_equals_lone(
@@ -122,7 +123,7 @@ def test_random_batch_equals_lone(
     assert_batch_is_lone(data.draw(networks), seed, reward)
 
 
-@pytest.mark.sample(15)
+@pytest.mark.sample(10)
 @pytest.mark.parametrize("reward", REWARDS)
 @anything
 @pytest.mark.medium

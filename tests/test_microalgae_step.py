@@ -128,7 +128,7 @@ class TestAccuracy:
     @every_model
     @pytest.mark.parametrize("interval", [0.0125, 0.25])
     @pytest.mark.medium
-    @pytest.mark.sample(3)
+    @pytest.mark.sample(1)
     def test_jumping_light(self, model: Model, interval: float) -> None:
         """X and Q to 1e-5 and the mean uptake to 1e-4, in every interval, from a start without nutrient."""
         reference = column(model, 26.0, 1.12, 0.0)

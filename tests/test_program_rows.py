@@ -299,6 +299,7 @@ def test_random_networks(
     assert_holds(play(network, rng, style, agents), degree, weight, merged)
 
 
+@pytest.mark.slow
 def test_the_random_networks_reach_what_matters(make_network: Callable[[int, int, int], Network]) -> None:
     """Among thirty of them are cut flows, valves on scheduled flows, series, several substeps, |net flow|, service."""
     met = dict.fromkeys(

@@ -224,8 +224,7 @@ class TestTasks:
             found.append(expected)
         assert 0.01 < np.mean(found) < 0.99
 
-    @pytest.mark.medium
-    @pytest.mark.sample(1)
+    @pytest.mark.slow
     @pytest.mark.parametrize(("robot", "script", "copies"), [(Fetch(), fetch, 100), (Reacher(), reacher, 100)])
     def test_scripts_do_the_task(self, robot: Robot, script: Callable[[ModelStates], Floats], copies: int) -> None:
         """Within 50 steps, in at least 95 of 100 attempts."""

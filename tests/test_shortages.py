@@ -214,7 +214,7 @@ def _first_year(network: Network) -> float:
 @pytest.mark.parametrize(
     ("seed", "separates"), [*((seed, False) for seed in range(12)), *((s, True) for s in range(8))]
 )
-@pytest.mark.sample(6)
+@pytest.mark.sample(4)
 def test_rows_hold_in_random_cycles(seed: int, separates: bool) -> None:
     """Supplies that are scarce, enough or ample; actions that stay at their ends for long starve and flood stocks."""
     network, rng = yearly_network(seed, SUPPLIED), np.random.default_rng(seed)

@@ -139,7 +139,7 @@ def test_the_record_says_which_budgets(kept: Any) -> None:
     assert (foresight != expected).any()
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_budgets_of_expected_amounts_that_cannot_be_meant_are_refused(kept: Any) -> None:
     """Out of reach, of no account, and prices of budgets for plans that cannot keep any."""
     text = r"no policy keeps an expected cost in year 1 at most 0\.1 EUR_2023 \(at .* tried 16 draws come to (\S+)\)"

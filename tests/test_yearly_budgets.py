@@ -396,8 +396,7 @@ def with_random_demand(network: Network) -> Network:
 
 
 @pytest.mark.parametrize("futures", [None, 2])
-@pytest.mark.medium
-@pytest.mark.sample(1)
+@pytest.mark.slow
 def test_mpc_in_a_disturbed_network_keeps_each_year(futures: int | None) -> None:
     """In each copy, whether a window has all of a year or a part of it; and serves as demanded, or nearly."""
     certain = quarterly(4)
