@@ -25,6 +25,10 @@ def degrees(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     def seen(*network: Any, degree: int, **options: Any) -> Bound:
         tried.append(degree)
         solution: Bound = bound(*network, degree=degree, **options)
+        near = options.get("near")
+        # what the network can reach is found once
+        assert solution.problem.system is (near or solution).problem.system
+        assert (near is None) == (len(tried) == 1)
         return solution
 
     monkeypatch.setattr(closing, "bound", seen)
