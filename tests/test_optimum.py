@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,6 +43,7 @@ from cirl_marl.optimum import (
     NoCertificate,
     Plan,
     bound,
+    bounds,
     envelope,
     improve_plan,
     program,
@@ -662,12 +664,20 @@ def test_bad_input(options: dict[str, object], said: str) -> None:
         bound(load_network("copper_net"), **options)  # type: ignore[call-overload]
 
 
-def test_near_bound_is_where_the_solver_starts() -> None:
+def test_near_bound_is_where_the_solver_starts(monkeypatch: pytest.MonkeyPatch) -> None:
     """From the solution for another level, start or even network the same optimum is found and proved."""
+    begun = list[Any]()
+
+    def watch(problem: Any, basis: Any = None, **options: Any) -> Any:
+        begun.append(basis)
+        return solve(problem, basis, **options)
+
+    monkeypatch.setattr(bounds, "solve", watch)
     alone = bound("carbo_net", min_service=0.95, horizon=12)
     start = alone.initial * 1.05
     for near in (bound("carbo_net", start, min_service=0.99, horizon=12), bound("copper_net", horizon=3)):
         found = bound("carbo_net", min_service=0.95, horizon=12, near=near)
+        assert begun[-1] is near.basis is not None
         assert found.objective == pytest.approx(alone.objective, rel=1e-6)
         assert found.verify().bound == found.objective
 
