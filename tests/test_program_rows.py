@@ -43,6 +43,7 @@ from cirl_marl import (
     Role,
     Service,
 )
+from cirl_marl.network.elements import FIXED_LIFETIME
 from cirl_marl.network.series import Series
 from cirl_marl.network.split_fractions import splits
 from cirl_marl.optimum import NoCertificate, bound
@@ -109,6 +110,10 @@ def certifiable(network: Network, interval: float, pulls: bool) -> Network:
         arcs.append(arc)
     nodes = [replace(node, initial=node.initial and (node.initial[1],) * 2) for node in network.nodes]
     shorter = min(interval, network.episode.control_interval)  # which its series cover
+    for i, node in enumerate(nodes):
+        if node.lifetime is not None and node.lifetime.distribution == FIXED_LIFETIME:  # of so many intervals
+            mean = node.lifetime.mean * shorter / network.episode.control_interval
+            nodes[i] = replace(node, lifetime=replace(node.lifetime, mean=mean))
     episode = replace(network.episode, control_interval=shorter, solver="exact", solver_step=None)
     return replace(network, nodes=tuple(nodes), arcs=tuple(arcs), episode=episode)
 
