@@ -47,7 +47,8 @@ LEAST_FEEDBACK = 1 / 64
 each interval, as it is conserved."""
 GROWN = 100.0
 """Norm beyond which a gradient is taken again with half the feedback, while that halves it at least. Where policies are
-steep it may grow beyond all numbers (a cycle of 3 agents and 160 decisions); on ``copper_net`` it is 5 at most."""
+steep it may grow beyond all numbers (a cycle of 3 agents and 160 decisions); on ``copper_net`` it came
+to 5."""
 MARGIN = 0.05
 """Least margin of a service, in parts of what may lack: where nothing is random its level swings about the demand."""
 LARGEST_NORM = 0.2
@@ -196,7 +197,7 @@ class GradientStack(ActorStack):
         return np.stack(rows)
 
     def _write_gradient(self, weight: float, prices: Floats, charges: Floats) -> None:
-        """Write it; ``weight`` is that of circularity, ``charges`` are by account."""
+        """Write the gradient; ``weight`` is that of circularity, ``charges`` are by account."""
         feedback, before = FEEDBACK, math.inf
         while True:
             with np.errstate(over="ignore", invalid="ignore"):
