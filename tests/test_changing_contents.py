@@ -169,6 +169,31 @@ def test_draws_and_disturbances_of_contents() -> None:
     np.testing.assert_allclose(certain.physical.stock[outside, 0], env.physical.stock[outside, 2], rtol=1e-11)
 
 
+@pytest.mark.parametrize("copper", [POORER, 0.15])
+@pytest.mark.parametrize("reserve", [None, 4.0])
+def test_supplies_carry_what_orders_of_as_much_carry(copper: Series | float, reserve: float | None) -> None:
+    """Each component of what nobody orders, but the mine makes up for, also where the mine runs empty."""
+    network, demand = mine(copper), Service(id="milled", provider="milled", quantity="flow", low=7.0)
+    ore = replace(network.nodes[0], initial=None if reserve is None else (reserve, reserve))
+    supply = replace(network.arcs[0], makes_up_for="milled")
+    services = demand, replace(network.services[1])
+    network = replace(network, nodes=(ore, *network.nodes[1:]), services=services)
+    supplied = replace(network, arcs=(supply, *network.arcs[1:]), default_agents=("lost",))
+    env, other = (MultiAgentVectorEnv(each, num_envs=1) for each in (supplied, network))
+    env.reset(seed=0), other.reset(seed=0)
+    row = network.control_rows["mined"].start
+    for _ in range(network.episode.horizon):
+        env.advance(np.full((1, 1), 0.3))
+        order = env.interval.controls[row, 0]
+        actions = {"mined": order / 5.0 - 1.0, "lost": 0.3}
+        other.advance(np.array([[actions[name]] for name in other.actuators.entries]))
+        for part in ("stock", "flow", "substances"):
+            of_env, of_other = getattr(env.physical, part), getattr(other.physical, part)
+            np.testing.assert_allclose(of_env, of_other, rtol=1e-9, atol=1e-12)
+    if reserve is None:
+        assert env.physical.flow[network.arc_index["milled"], 0] == pytest.approx(7.0, rel=1e-9)
+
+
 def test_draws_that_do_not_change_still_have_reserves() -> None:
     """A disturbance that stands still makes a series, so that starts of the draw are those of the network."""
     still = Markov(values=(1.0, 0.5), lengths=(1e9, 1e9), start=1)

@@ -108,6 +108,11 @@ class Supply:
         )
         self._reads_flows = bool(of_flows)
         self.indices: Integers = np.array([network.arc_index[arc] for arc in self.arcs], dtype=np.intp)
+        # what is supplied is an order of each component
+        staged_network = dynamics.staged_network
+        copies = [staged_network.components_of(id_) for id_ in self.arcs]
+        self._order_arcs = np.array([staged_network.arc_index[id_] for ids in copies for id_ in ids], dtype=np.intp)
+        self._order_rows: Integers = np.repeat(self.rows, [len(ids) for ids in copies])
         self.arrivals = Arrivals(dynamics, services, self.indices)
         self._interval = interval = network.episode.control_interval
         self.duration = np.array([interval if service_.quantity == "stock" else 1.0 for service_ in services])[:, None]
@@ -208,7 +213,7 @@ class Supply:
                 all_controls[self.rows] = np.where(idle, range_.amounts(extent), controls[self.rows])
                 copies, earlier, base = np.flatnonzero(open_), base, base.copy()
                 rate = unit_rate.copy()
-                rate[self.indices] *= all_controls[self.rows]
+                rate[self._order_arcs] *= all_controls[self._order_rows]
                 inputs = _of_copies(copies, stock, inner, all_controls, step, factors, routes, rate)
                 if terms is None:
                     part = dynamics.advance(*inputs)
