@@ -23,6 +23,7 @@ from cirl_marl import (
     Node,
     Objective,
     Role,
+    Series,
     Service,
     load_network,
 )
@@ -157,6 +158,32 @@ def test_keeps_a_stock_that_programs_would_hold_back(replan: int, stock: float, 
     orders = np.diff(held) + np.minimum(sales, held[:-1])
     assert run.episode_levels.min() == pytest.approx(demand, abs=2e-4)
     assert run.episode_circularity[0] == pytest.approx(-orders.sum() / 5, rel=1e-3)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_a_stock_that_has_all_but_emptied_does_not_stop_plans(scale: float) -> None:
+    """Presolve finds no solution of its program; without presolve there is one, as every action is an episode."""
+    years = Series(times=(0.0, 373.3, 1323.0), values=(1.0256, 0.5197, 0.5197))
+    stretch = Control(kind=ControlKind.STRETCH, low=1.1922, neutral=1.2265, high=1.5017)
+    lifetime = Lifetime(mean=213.0, deviation=100.2, distribution="normal")
+    network = Network(
+        name="left_over",
+        nodes=(
+            Node(id="old", initial=(0.1 * scale,) * 2, lifetime=lifetime, control=stretch, stretch=years),
+            Node(id="new", initial=(5.0 * scale,) * 2, rate=1 / 206.67),
+            Node(id="tip", role=Role.LANDFILL, initial=(0.0, 0.0)),
+        ),
+        arcs=(
+            Arc(id="discard", donor="old", recipient="tip", law=Law.SHARE),
+            Arc(id="wear", donor="new", recipient="tip", law=Law.SHARE),
+        ),
+        services=(Service(id="use", provider="new", quantity="stock", low=5.0 * scale),),
+        episode=Episode(control_interval=365.25, horizon=3),
+        default_agents=("old",),
+    )
+    controller = MPC(min_service=0.06)
+    rollout(MultiAgentVectorEnv(network, num_envs=1), controller)
+    assert not controller.note
 
 
 def test_a_service_out_of_reach_is_approached() -> None:

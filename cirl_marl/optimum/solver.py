@@ -175,12 +175,18 @@ def solve(
     size = np.maximum(np.abs(problem.low), np.abs(problem.high))
     short_form = None if basis is not None else _with_short_rows(problem, size)
     program = _ScaledProgram(*(short_form or (problem, size)))
+    without_presolve = False
     for settings in (None, *attempts) if basis is not None else attempts:
+        has_presolve = settings is not None and settings.get("presolve") != "off"
+        if without_presolve and has_presolve:
+            continue
         highs = program.run(settings, basis if settings is None else None, primal=same_rows, is_near=is_near)
         model_status = highs.getModelStatus()
         status, is_refused = highs.modelStatusToString(model_status), model_status in NO_PLAN
         if is_refused and settings is not None and not certify:
-            break
+            if not has_presolve:
+                break
+            without_presolve = True
         if not program.is_feasible(highs):
             continue
         solution = program.solution(highs)
@@ -195,7 +201,7 @@ def solve(
         is_interior = settings is not None and settings.get("run_crossover") == "off"
         if best <= (NEAR if is_large else FAIR if is_interior else OPTIMAL):
             break
-    # presolve errs now and then, so the last settings, without it, have the last word
+    # presolve errs now and then, so settings without it have the last word
     if answer is None and is_refused:
         raise Infeasible(f"network '{name}': HiGHS finds that nothing satisfies {label}")
     if answer is None or (certify and best > USABLE):
