@@ -10,7 +10,20 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cirl_marl import MPC, Arc, Control, ControlKind, Episode, Law, MultiAgentVectorEnv, Network, Node, Role, Service
+from cirl_marl import (
+    MPC,
+    Arc,
+    Control,
+    ControlKind,
+    Episode,
+    Law,
+    MultiAgentVectorEnv,
+    Network,
+    Node,
+    Objective,
+    Role,
+    Service,
+)
 from cirl_marl.controllers.rollout import Rollout, episode_start
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.plans import plan as tell_plan
@@ -106,6 +119,44 @@ def simulate(network: Network, action: float) -> Rollout:
     env = MultiAgentVectorEnv(network, num_envs=1)
     shares = np.full((network.episode.horizon, 1), action)
     return episode_start(env).play(env, Replay(shares))
+
+
+@pytest.mark.parametrize("demand", [0.1, 0.106])
+def test_a_plan_that_is_short_is_begun_elsewhere_too(demand: float) -> None:
+    """From the actions of the bound nothing but 0.027 is found beside a budget; without it the plan keeps both."""
+    source, market, tip = "source", "market", "tip"
+
+    def ordered(recipient: str, name: str, span: tuple[float, float], cost: float) -> Arc:
+        control = Control(kind=ControlKind.FLOW, low=span[0], neutral=span[0], high=span[1])
+        law, accounts = Law.CONTROLLED, {"cost": cost}
+        return Arc(donor=source, recipient=recipient, id=name, law=law, control=control, accounts=accounts)
+
+    share = Control(kind=ControlKind.SHARE, low=0.0, neutral=0.1375, high=0.1466)
+    network = Network(
+        name="yard",
+        nodes=(
+            Node(id=source, initial=(0.2813, 0.2813), role=Role.ENVIRONMENT),
+            Node(id=tip, initial=(0.0, 0.0), role=Role.INCINERATOR),
+            Node(id=market, stores=False),
+        ),
+        arcs=(
+            ordered(tip, "sold", (7.785, 29.88), -0.2291),
+            Arc(donor=market, recipient=tip, id="lost", law=Law.SHARE, control=share),
+            Arc(donor=market, recipient=tip, id="rest", law=Law.SHARE),
+            replace(ordered(market, "idle", (0.0, 3.866), 1.138), makes_up_for="made", weight=0.08),
+            replace(ordered(market, "order", (0.845, 8.45), 0.5731), makes_up_for="made", weight=0.92),
+        ),
+        services=(Service(id="made", provider=market, also=(source,), quantity="outflow", low=1.2298, high=1.2298),),
+        accounts=(Account(id="cost", unit="EUR_2023"),),
+        episode=Episode(control_interval=0.019165, horizon=3),
+        objective=Objective(reference_interval=0.23, net_zero="abs", circularity_scale=0.148),
+        default_agents=("sold", "lost", "order"),
+        time_unit="year",
+    )
+    solution = bound(network, min_service=demand, at_most={"cost": -0.0423})
+    run = simulate_plan(improve_plan(solution))
+    assert run.episode_levels[0, 0] >= demand - 1e-4 and run.accounts[0, 0] <= -0.0423 + 1e-6
+    assert simulate_plan(improve_plan(solution, starts=1)).episode_levels[0, 0] < demand
 
 
 def test_what_a_band_cannot_keep_is_said() -> None:

@@ -98,15 +98,19 @@ def improve_plan(
     slopes = slopes_of(bound.actions.shape, Dynamics(network))
     if slopes > MOST_SLOPES:
         return refine(bound, enough=enough, progress=progress)
-    starts = start_count(network, slopes) if starts is None else starts
+    # bands have local optima, too: where the first plan is short, others are begun from in a small network
+    usual = start_count(network, slopes) if starts is None else starts
+    starts = SMALL_STARTS if starts is None and slopes <= SMALL else usual
     trials = _trials(bound)
     plans: list[Bound] = []
     for start, actions in enumerate(starting_actions(bound.actions, starts)):
-        report = partial(_tell, progress, start, starts)
+        if start >= usual and trials.total_shortage(simulate_plan(plans[-1])) == 0.0:
+            break
+        report = partial(_tell, progress, start, usual) if start < usual else lambda share: None
         first = replace(bound, actions=actions)
         plan, _ = climb(first, trials, prices(bound), rounds, enough, report, least_gain=least_gain, demand_first=True)
         plans.append(plan)
-    if starts == 1:
+    if len(plans) == 1:
         return plans[0]
     runs, price = [simulate_plan(plan) for plan in plans], prices(bound)
     shortages = [trials.total_shortage(run) for run in runs]
