@@ -220,6 +220,11 @@ REFINERY = 'initial = { low = 60.0, high = 90.0, unit = "kt"'
         (HORIZON, HORIZON.replace('"1"', '"steps"'), ["episode.horizon", "'steps'", "counts control intervals"]),
         ('mass = "kt"', 'mass = "day"', ["units.mass", "'day'"]),
         ("neutral = 40, high = 120", "neutral = 140, high = 120", ["'use_to_collection'", "140", "120"]),
+        (
+            "neutral = 40, high = 120",
+            "neutral = 40, high = { times = [], values = [] }",
+            ["arcs.use_to_collection.control.high.values", "at least 1"],
+        ),
         ("low = 0, neutral = 40", "low = -5, neutral = 40", ["'use_to_collection'", "-5", "reverse"]),
         (
             'kind = "flow", low = 0',

@@ -159,6 +159,7 @@ def test_mistakes_of_disturbances_are_named(changes: dict[str, Disturbance], mes
         ),
         ({}, Correlation(names=("price", "outage"), matrix=((1, 0), (0, 1))), "'outage' is of kind 'markov'"),
         ({}, Correlation(names=("price", "ore"), matrix=((1, 0.5), (0.4, 1))), "is no correlation: symmetric"),
+        ({}, Correlation(names=(), matrix=()), "names: needs two disturbances or more, got 0"),
         (
             {},
             Correlation(names=("price", "ore", "walk"), matrix=((1, 0.9, -0.9), (0.9, 1, 0.9), (-0.9, 0.9, 1))),

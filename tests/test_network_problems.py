@@ -83,6 +83,10 @@ DIGESTER: dict[str, Any] = {"model": Digester(), "inner": ((1.0, 1.0),) * 6}
             r"arc 'k': flow: series has 1 times and 2 values: one for each \(x.csv, t\)$",
         ),
         ({"arcs": (replace(FED, flow=Series(times=(), values=())),)}, "series has 0 times and 0 values"),
+        (
+            {"arcs": (replace(ORDER, control=replace(BACKWARD, low=0.0, neutral=Series(times=(), values=()))),)},
+            "series has 0 times and 0 values",
+        ),
         ({"arcs": (replace(FED, flow=steps(0.0, math.nan)),)}, "times must increase and be finite, but nan follows 0"),
         ({"arcs": (replace(FED, flow=steps(0.0, math.inf)),)}, "times must increase and be finite, but inf follows 0"),
         ({"arcs": (replace(FED, flow=steps(0.0, 2.0, 1.0)),)}, "times must increase and be finite, but 1 follows 2"),

@@ -339,6 +339,7 @@ BAD: dict[str, tuple[dict[str, str], str]] = {
     "anywhere": ({"weights": "/any/a.safetensors"}, "row 2: weights '/any/a.safetensors' are not below the folder"),
     "nobody": ({"algorithm": " "}, "row 2: algorithm is empty; name one of the suite, or your own"),
     "a seed of nobody": ({"algorithm": "neutral"}, "row 2: seed 401: 'neutral' is not trained; leave it empty"),
+    "steps of nobody": ({"algorithm": "neutral", "seed": ""}, "row 2: steps 10240: 'neutral' is not trained; write 0"),
     "only a variant": ({"variant": "1"}, "has no rows but those of held-out variants to rerun"),
 }
 

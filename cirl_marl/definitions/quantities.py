@@ -120,7 +120,7 @@ class AmountSeries(Table):
     """Numbers that change in time, in the unit of the table in which they stand."""
 
     times: list[Time] = Field(description="when each value holds; the first not after the start of the episode")
-    values: list[Number] = Field(description="one for each time")
+    values: list[Number] = Field(description="one for each time", min_length=1)
     interpolation: Interpolation = "step"
     time_unit: TimeUnit = None
     until: Time | None = Field(

@@ -405,6 +405,9 @@ class Correlation(CheckedRecord):
                 kind = disturbances[name].kind
                 yield f"'{name}' is of kind '{kind}'; only ar1, random_walk and seasonal can be correlated"
         count, matrix = len(self.names), self.matrix
+        if count < 2:
+            yield f"names: needs two disturbances or more, got {count}"
+            return
         if len(set(self.names)) < count:
             yield "names: a disturbance stands there twice"
         if len(matrix) != count or any(len(row) != count for row in matrix):

@@ -115,6 +115,8 @@ def read_rows(path: Path = KEPT_RESULTS) -> list[ResultRow]:
             raise RunError(f"{place}: algorithm is empty; name one of the suite, or your own")
         if row.algorithm in CONTROLLERS and row.seed is not None:
             raise RunError(f"{place}: seed {row.seed}: '{row.algorithm}' is not trained; leave it empty")
+        if row.algorithm in CONTROLLERS and row.steps:
+            raise RunError(f"{place}: steps {row.steps}: '{row.algorithm}' is not trained; write 0")
         if (weights := Path(row.weights)).is_absolute() or ".." in weights.parts:
             raise RunError(f"{place}: weights '{row.weights}' are not below the folder of the table")
         if rows.setdefault(key_of(row), row) is not row:
