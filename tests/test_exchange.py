@@ -191,10 +191,16 @@ def test_what_no_file_holds_is_refused_before_anything_is_simulated(
         (["paper_city", "--iamc", iamc], "IAMC has calendar years; give [episode] a start at the turn of a year"),
         ([str(twice), "--iamc", iamc], "Circularity would come 2 times; give other titles"),
         ([*japan, "--package", str(tmp_path / "file" / "data")], "file is a file, not a folder"),
+        ([*japan, "--iamc", "new.csv", "--out", "new.csv"], "--iamc new.csv: is the folder of --out; give another"),
     ):
-        refused = CliRunner().invoke(app, ["simulate", *arguments, "--out", str(tmp_path)])
+        refused = CliRunner().invoke(app, ["simulate", "--out", str(tmp_path), *arguments])
         assert isinstance(refused.exception, CirlError) and message in str(refused.exception)
     assert {path.name for path in tmp_path.iterdir()} == {"file", "twice.toml"}
+    (tmp_path / "plan.xlsx").mkdir()
+    planned = ["plan", "copper_net", "--control", "neutral", "--out", str(tmp_path / "plan.csv")]
+    with pytest.raises(CirlError, match=r"--out .*plan\.csv: .*plan\.xlsx is a folder, not a file"):
+        CliRunner().invoke(app, planned, catch_exceptions=False)
+    assert {path.name for path in tmp_path.iterdir()} == {"file", "twice.toml", "plan.xlsx"}
 
 
 def test_the_command_writes_years_of_scenarios_and_controls(tmp_path: Path) -> None:

@@ -104,6 +104,13 @@ def test_kernels_enclose_what_leaves(distribution: str, deviation: float, mean: 
         for each in (kernel.survivors_low, kernel.survivors_high)
     )
     assert (least <= stock * (1 + 1e-9)).all() and (stock <= most * (1 + 1e-9)).all()
+    at_any_time, of_start = kernel.least
+    floor = np.array([(rows @ start).min() for rows in of_start]) + np.einsum("pqj,qj->p", at_any_time, entered)
+    assert (floor <= leaving.min(axis=1) + rounding).all() and (at_any_time[np.triu_indices(pieces)] == 0.0).all()
+    if degree and mean > 20:
+        assert (floor[3:] >= 0.8 * leaving[3:].min(axis=1) - chain.weights[0]).all()
+    even, other = (Kernel(chain, np.append(np.full(5, rate[0]), last), 1.0, degree) for last in (rate[0], rate[-1]))
+    np.testing.assert_allclose(even.least[0][:5, :5], other.least[0][:5, :5], rtol=1e-9, atol=1e-15)
     if degree == 0:
         np.testing.assert_array_equal(kernel.low, kernel.high)
     elif mean > 20:
@@ -453,7 +460,7 @@ def test_constant_parts_of_lifetimes_are_nearly_all_that_leaves(lifetime: Lifeti
     run = rollout(MultiAgentVectorEnv(network, num_envs=1), Neutral())
     left = run.flow[:, network.arc_index["discard"]]
     assert (least <= left).all() and (
-        left - least <= 10.0 * (in_a_year + 0.8 / (lifetime.deviation * np.sqrt(2 * np.pi)))
+        left - least <= 10.0 * (in_a_year + 1.0 / (lifetime.deviation * np.sqrt(2 * np.pi)))
     ).all()
 
 

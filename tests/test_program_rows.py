@@ -48,6 +48,7 @@ from cirl_marl.network.series import Series
 from cirl_marl.network.split_fractions import splits
 from cirl_marl.optimum import NoCertificate, bound
 from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.kernels import stock_response
 from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.program import Program, Programs
 from cirl_marl.optimum.quasi_steady import cut_responses
@@ -556,6 +557,70 @@ def test_merged_pieces_are_as_tight() -> None:
     proved = [-float(problem.cost @ solve(problem).plan) for problem in (fine, merged)]
     assert len(merged.cost) < 0.1 * len(fine.cost)
     assert proved[1] == pytest.approx(proved[0], rel=0.05)
+
+
+@given(
+    turnover=st.floats(0.0, 40.0),
+    degree=st.integers(1, 3),
+    inflow=st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12),
+)
+def test_a_stock_holds_what_enters_it(turnover: float, degree: int, inflow: list[float]) -> None:
+    """Of any inflow its means are enclosed, nearly so of an even one into a slow stock: with x' = u − z x, in steps."""
+    means, low, high = stock_response(turnover, degree)
+    steps = 120
+    time, entering = (np.arange(steps) + 0.5) / steps, np.resize(np.repeat(inflow, steps // len(inflow)), steps)
+    weights = np.array([math.comb(degree, i) * time**i * (1 - time) ** (degree - i) for i in range(degree + 1)])
+    held, stock, of_start = 0.0, np.empty(steps), np.exp(-turnover * time)
+    decay, gain = math.exp(-turnover / steps), -math.expm1(-turnover / steps) / turnover if turnover else 1.0 / steps
+    for k, u in enumerate(entering.tolist()):
+        later = decay * held + gain * u
+        stock[k], held = (held + later) / 2, later
+    of_stock, of_inflow, known = ((degree + 1) * weights @ each / steps for each in (stock, entering, of_start))
+    rounding = 3e-3 + 1e-3 * turnover
+    np.testing.assert_allclose(means, known, atol=rounding)
+    assert (low @ of_inflow <= of_stock + rounding).all() and (of_stock <= high @ of_inflow + rounding).all()
+    even = np.ones(degree + 1)
+    assert ((high - low) @ even <= 0.3).all()
+
+
+def two_yards(*others: Node) -> Network:
+    """Return a cycle with a furnace that melts what is collected in days, beside which others lose what they hold."""
+    share = Control(kind=ControlKind.SHARE, low=0.2, neutral=0.5, high=0.9)
+    order = Control(kind=ControlKind.FLOW, low=0.0, neutral=1.0, high=4.0)
+    return Network(
+        name="yards",
+        nodes=(
+            Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR, initial=(500.0, 500.0)),
+            Node(id="market", stores=False),
+            Node(id="use", initial=(20.0, 20.0)),
+            Node(id="waste", stores=False),
+            Node(id="furnace", initial=(0.1, 0.1)),
+            *others,
+            Node(id="tip", role=Role.LANDFILL, initial=(0.0, 0.0)),
+        ),
+        arcs=(
+            Arc(id="mining", donor="mine", recipient="market", law=Law.CONTROLLED, control=order),
+            Arc(id="made", donor="market", recipient="use", law=Law.SHARE),
+            Arc(id="old", donor="use", recipient="waste", rate=0.1),
+            Arc(id="collected", donor="waste", recipient="furnace", law=Law.SHARE, control=share),
+            Arc(id="lost", donor="waste", recipient="tip", law=Law.SHARE),
+            Arc(id="melted", donor="furnace", recipient="market", rate=15.0),
+            *(Arc(id=f"{node.id}_gone", donor=node.id, recipient="tip", rate=1.9) for node in others),
+        ),
+        services=(Service(id="in_use", provider="use", quantity="stock", low=20.0),),
+        time_unit="year",
+        episode=Episode(control_interval=1.0, horizon=6),
+    )
+
+
+def test_what_is_elsewhere_does_not_loosen_a_bound() -> None:
+    """A stock that empties within a year, in a network with a furnace that follows only slow ones."""
+    proved = []
+    for others in ((), (Node(id="heap", initial=(1e-6, 1e-6)),)):
+        programs = Programs(Admissible.of(two_yards(*others)), 1, None, merge_pieces=True)
+        problem = programs.program(programs.admissible.network.initial.mean(axis=0), 0.9)
+        proved.append(-float(problem.cost @ solve(problem).plan))
+    assert proved[1] == pytest.approx(proved[0], rel=1e-5)
 
 
 @pytest.mark.parametrize("rate", [0.7, 8.0])

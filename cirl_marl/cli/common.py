@@ -188,12 +188,17 @@ def page_for(path: Path | None) -> Path | None:
     return None if path is None else file_for(path, "--html", ".html")
 
 
-def file_for(path: Path, option: str, suffix: str) -> Path:
-    """Return where a file goes; a ``CirlError`` names the option if it has another ``suffix`` or cannot go there."""
+def file_for(path: Path, option: str, suffix: str, beside: Sequence[str] = ()) -> Path:
+    """Return where a file goes, and others ``beside`` it that have its stem and these suffixes.
+
+    Raises:
+        CirlError: naming the option, if it has another ``suffix`` or cannot go there.
+    """
     if path.suffix != suffix:
         raise CirlError(f"{option} {path}: needs the name of {'an' if suffix == '.html' else 'a'} {suffix} file")
-    if path.is_dir():
-        raise CirlError(f"{option} {path}: is a folder, not a file")
+    for file in (path, *map(path.with_suffix, beside)):
+        if file.is_dir():
+            raise CirlError(f"{option} {path}: {'' if file is path else f'{file} '}is a folder, not a file")
     _check_writable(path, f"{option} {path}")
     return path
 

@@ -75,7 +75,8 @@ def simulate(
     if iamc is not None:
         from cirl_marl.report.iamc import iamc_years, write_iamc
 
-        common.file_for(iamc, "--iamc", ".csv")
+        if common.file_for(iamc, "--iamc", ".csv").absolute() == folder.absolute():
+            raise CirlError(f"--iamc {iamc}: is the folder of --out; give another name")
         changes = {} if steps is None else {"episode": {"horizon": steps}}
         variants = [definition.scenario(name).with_options(**changes) for name in scenarios]
         iamc_years([(variant, name) for variant in variants for name in controls])
@@ -222,7 +223,7 @@ def plan(
     from cirl_marl.report.decisions import NO_WORKBOOK, decisions_table, savings_table, write_decisions
 
     if out is not None:
-        common.file_for(out, "--out", ".csv")
+        common.file_for(out, "--out", ".csv", beside=(".xlsx", ".png"))
     page = common.page_for(html)
     options: dict[str, Any] = {"scenario": scenario, "min_service": min_service, "seed": seed, "smooth": smooth}
     options |= {"gap": gap, "aim": _aim(aim), "at_most": common.budgets(at_most)}

@@ -6,9 +6,10 @@ Theorem 4 of docs/bound.md has the notation; here a piece has length 1, and σ =
 from __future__ import annotations
 
 import math
-from functools import cache
+from functools import cache, cached_property, lru_cache
 
 import numpy as np
+from scipy import special
 from scipy.linalg import expm
 
 from cirl_marl.network import Floats
@@ -41,7 +42,8 @@ class Kernel:
         self.survivors_low, self.survivors_high = np.zeros((2, pieces, pieces, moments))
         unit = chain.matrix / chain.rate
         motions = {mu: _Motion(unit, mu * length, chain.inflow_shares, degree) for mu in np.unique(rate).tolist()}
-        parts = [motions[mu] for mu in rate.tolist()]
+        parts = self._parts = [motions[mu] for mu in rate.tolist()]
+        self._length = length
         later_outflow, transfer = np.empty((0, moments, stages)), np.eye(stages)
         for p, motion in enumerate(parts):
             self.start_outflow[p] = motion.outflow @ transfer / length
@@ -64,6 +66,29 @@ class Kernel:
         at_once = chain.weights[0] * np.eye(pieces * moments).reshape(shape)
         self.low += at_once
         self.high += at_once
+
+    @cached_property
+    def least(self) -> tuple[Floats, list[Floats]]:
+        """The least that leaves at any time of each piece.
+
+        Of what enters, by its moments, but for w_0, shape (pieces, pieces, d + 1); and of what is there, the least
+        product of a matrix (some, stages) with it in each piece, 1/time.
+        """
+        pieces, _, _, moments = self.low.shape
+        parts, least = self._parts, np.zeros((pieces, pieces, moments))
+        is_even = all(part is parts[0] for part in parts)
+        later: list[Floats] = []  # of what is there at the end of a piece, what leaves in the later ones
+        for q in reversed(range(-1, pieces)):
+            if q + 1 < pieces:
+                later = [parts[q + 1].outflows, *(rows @ parts[q + 1].whole for rows in later)]
+            if q < 0 or (is_even and q > 0) or not later:
+                continue
+            low = parts[q].later.bounds(np.concatenate(later) / moments)[0][:, 0]
+            ends = np.cumsum([len(rows) for rows in later])[:-1]
+            least[q + 1 :, q] = [part.min(axis=0) for part in np.split(low, ends)]
+        for q in range(1, pieces if is_even else 0):
+            least[q:, q] = least[: pieces - q, 0]
+        return least, [rows / self._length for rows in later]
 
     @property
     def looseness(self) -> float:
@@ -111,16 +136,45 @@ class _Motion:
         stages, matrix = len(unit), unit * turnover
         means, self.whole = bernstein_means(matrix, degree)
         self.outflow = turnover * means[:, -1]
+        self._matrix, self._turnover = matrix, turnover
         self.later = _Smooth(matrix, inflow_shares[:, None], degree)
-        # y' = A y + E ψ_0, ψ_l' = ψ_(l+1): with ψ_0 the polynomial, read from the end of the piece
-        block_matrix = np.zeros((stages + degree + 1,) * 2)
-        block_matrix[:stages, :stages], block_matrix[:stages, stages] = matrix, inflow_shares
-        block_matrix[stages:, stages:] = np.eye(degree + 1, k=1)
-        start = np.zeros((stages + degree + 1, degree + 1))
-        start[stages:] = np.stack([_derivatives(degree, degree - i) for i in range(degree + 1)], axis=1)
-        last = np.zeros((1, stages + degree + 1))
-        last[0, stages - 1] = turnover
-        self.own_bounds = _Smooth(block_matrix, start, degree).bounds(last)
+        self.own_bounds = _own_bounds(matrix, inflow_shares, turnover * np.eye(stages)[[-1]], degree)
+
+    @cached_property
+    def outflows(self) -> Floats:
+        """What leaves of what is there at its start: at any time between the least and the greatest row."""
+        last = self._turnover * np.eye(len(self._matrix))[-1:]
+        return np.concatenate([part[:, 0].T for part in _series(self._matrix.T, last.T)])
+
+
+@lru_cache(maxsize=2**14)
+def stock_response(turnover: float, degree: int) -> tuple[Floats, Floats, Floats]:
+    """Return what a stock, of which a constant part leaves, holds of what is there at the start of a piece and enters.
+
+    Args:
+        turnover: z, so that x' = u − z x in a piece of length 1.
+        degree: d.
+
+    Returns:
+        The means of e^(−zs) under B_i, shape (d + 1,), and c̲ and c̄, shape (d + 1, d + 1) each: of the means U_j of an
+        inflow that is not negative, Σ_j c̲_ij U_j ≤ X_i ≤ Σ_j c̄_ij U_j if nothing is there at the start.
+    """
+    low, high = _own_bounds(np.array([[-turnover]]), np.ones(1), np.ones((1, 1)), degree)
+    return special.hyp1f1(np.arange(degree + 1) + 1, degree + 2, -turnover), low[0], high[0]
+
+
+def _own_bounds(matrix: Floats, inflow_shares: Floats, rows: Floats, degree: int) -> tuple[Floats, Floats]:
+    """Enclose combinations of stages, weighted with B_i, of what enters them in the piece, (rows, d + 1, d + 1) each.
+
+    y' = A y + E ψ_0, ψ_l' = ψ_(l+1): with ψ_0 the polynomial, read from the end of the piece.
+    """
+    stages = len(matrix)
+    block_matrix = np.zeros((stages + degree + 1,) * 2)
+    block_matrix[:stages, :stages], block_matrix[:stages, stages] = matrix, inflow_shares
+    block_matrix[stages:, stages:] = np.eye(degree + 1, k=1)
+    start = np.zeros((stages + degree + 1, degree + 1))
+    start[stages:] = np.stack([_derivatives(degree, degree - i) for i in range(degree + 1)], axis=1)
+    return _Smooth(block_matrix, start, degree).bounds(np.pad(rows, ((0, 0), (0, degree + 1))))
 
 
 class _Smooth:
@@ -132,21 +186,13 @@ class _Smooth:
         if degree == 0:
             self._near, self._rest = (bernstein_means(matrix, 0)[0][0] @ start)[:, :, None], np.zeros((*start.shape, 1))
             return
-        count = max(1, math.ceil(float(np.abs(matrix).sum(axis=0).max(initial=0.0)) / 2))
         nodes = (1 - np.cos(np.pi * (2 * np.arange(degree + 1) + 1) / (2 * degree + 2))) / 2
         polynomials = [math.comb(degree, j) * nodes**j * (1 - nodes) ** (degree - j) for j in range(degree + 1)]
         bernstein = np.stack(polynomials, axis=1)
         values = np.stack([expm(matrix * node) @ start for node in nodes], axis=2)
         self._near = values @ np.linalg.inv(bernstein).T  # coefficients of B_j(σ) that interpolate, shape (n, z, d + 1)
-        step, at = expm(matrix / count), start
-        pieces = []
-        for part in range(count):
-            term, powers = at, []
-            for m in range(TERMS + 1):
-                powers.append(term)
-                term = matrix @ term / (count * (m + 1))
-            pieces.append(np.stack(powers, axis=2) @ _to_bernstein(TERMS) - self._near @ _within(degree, part, count))
-            at = step @ at
+        parts = _series(matrix, start)
+        pieces = [part - self._near @ _within(degree, place, len(parts)) for place, part in enumerate(parts)]
         self._rest = np.concatenate(pieces, axis=2)
 
     def bounds(self, rows: Floats) -> tuple[Floats, Floats]:
@@ -157,6 +203,20 @@ class _Smooth:
         low = near + rest.min(axis=2, initial=0.0, keepdims=True) - margin
         high = near + rest.max(axis=2, initial=0.0, keepdims=True) + margin
         return low[:, :, ::-1], high[:, :, ::-1]
+
+
+def _series(matrix: Floats, start: Floats) -> list[Floats]:
+    """Return e^(Mσ) z on equal parts of [0, 1], as coefficients of B_m of degree ``TERMS``, shape (n, z, TERMS + 1)."""
+    count = max(1, math.ceil(float(np.abs(matrix).sum(axis=0).max(initial=0.0)) / 2))
+    step, at, parts = expm(matrix / count), start, []
+    for _ in range(count):
+        term, powers = at, []
+        for m in range(TERMS + 1):
+            powers.append(term)
+            term = matrix @ term / (count * (m + 1))
+        parts.append(np.stack(powers, axis=2) @ _to_bernstein(TERMS))
+        at = step @ at
+    return parts
 
 
 def bernstein_means(matrix: Floats, degree: int, length: float = 1.0) -> tuple[Floats, Floats]:

@@ -44,6 +44,7 @@ from cirl_marl.optimum.matrices import BEFORE, NOW, ChainedRows, IntervalCache, 
 from cirl_marl.optimum.mixtures import content_rows, mixture_rows
 from cirl_marl.optimum.quasi_steady import end_laws, has_fast_stocks, quasi_steady_rows
 from cirl_marl.optimum.reach import ComparisonSystem, Reach
+from cirl_marl.optimum.responses import response_rows
 from cirl_marl.optimum.shortages import shortage_rows
 from cirl_marl.optimum.transit import ConstantShares, Transit, steady_rows
 from cirl_marl.optimum.vintages import Lifetimes
@@ -183,6 +184,7 @@ class Programs:
         service_levels(ranges, under)
         if layout.degree:
             decay_rows(ranges, under_links)
+            response_rows(ranges, under_links)
         else:
             mean_stocks(ranges, equal_links)
             held_arcs = np.flatnonzero(ranges.proportional & (ranges.rate[0] < ranges.rate[1]))

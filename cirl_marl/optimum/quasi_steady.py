@@ -2,12 +2,15 @@
 
 Take the stores of a residence time far below a piece as fast, x, the others as slow. With the controls of an interval
 ẋ = M x + g, the entries of M off the diagonal and g, the flows from slow stocks and by schedule, are not negative.
-What a slow stock drives falls at most like e^{−κs}, so g(s) ≤ e^{κ(δ−s)} g(δ), and hence::
+What a slow stock drives falls at most like e^{−κs}, so g(s) ≤ e^{κ(δ−s)} g(δ), κ that of the fastest of the slow stocks
+which drive a node, and hence::
 
     x(s) ≤ e^{κ(δ−s)} x(δ) + e^{Ms} x(0)
 
-A larger M̄ in place of M makes the last term, the transient, larger. The same holds for all flows that follow from x
-and g, and for (w − w̲) and (w̄ − w) times what a factor w acts on. Of x_j, which leaves at a rate of at least k::
+A larger M̄ in place of M makes the last term, the transient, larger. What leaves a lifetime may fall faster: where a
+part of it is constant (theorem 6), the rest is allowed for as if it passed in whatever moment. The same holds for all
+flows that follow from x and g, and for (w − w̲) and (w̄ − w) times what a factor w acts on. Of x_j, which leaves at a
+rate of at least k::
 
     x_j(δ) ≤ (1 − e^{−(k−κ)δ})/(k − κ)·(what enters j at the end) + (e^{Mδ} x(0))_j
 """
@@ -84,12 +87,11 @@ def quasi_steady_rows(ranges: IntervalRanges, linear: Linear, rows: ProgramRows)
     if (ranges.driver[~has_schedule] != network.donors[~has_schedule]).any():
         return  # what recipients pull may make a stock fall faster than in proportion to it
     stores = len(network.stores)
-    least, most = ranges.exits[:, :stores]
+    least = ranges.exits[0, :stores]
     by_schedule = np.bincount(network.donors[has_schedule], minlength=stores)[:stores] > 0
     _write_held_factors(ranges, rows, ~by_schedule)
     fast = (least * layout.length >= FAST) & ~by_schedule
-    slowest = float(most[~fast & ~by_schedule].max(initial=0.0))
-    _QuasiSteady(ranges, linear, rows, fast).write(slowest)
+    _QuasiSteady(ranges, linear, rows, fast).write()
 
 
 def _write_held_factors(ranges: IntervalRanges, rows: ProgramRows, usable: NDArray[np.bool_]) -> None:
@@ -127,6 +129,9 @@ class _QuasiSteady:
         self.ranges, self.layout, self.rows = ranges, rows.layout, rows
         self.network, self.stores = ranges.network, len(ranges.network.stores)
         self.fast = np.flatnonzero(fast)
+        # out of lifetimes whose flow has a constant part
+        exits = np.flatnonzero(ranges.leaves_lifetime & ~ranges.by_schedule)
+        self.exits = np.intersect1d(exits, rows.layout.steady_arcs)
         self._find_sources(fast)
         gains = linear.gains.toarray()[np.ix_(fast, fast)]
         exits = np.diag(ranges.exits[0, self.fast])
@@ -158,39 +163,65 @@ class _QuasiSteady:
             through &= hands_on[donors]
             np.logical_or.at(self.schedules, recipients[through], self.schedules[donors[through]])
         self.follows = hands_on & ~wrong
+        # κ of each node: the greatest rate of the slow stocks that it follows from, but for those lifetimes
+        links = np.setdiff1d(stock_driven, self.exits)
+        donors, recipients = network.donors[links], network.recipients[links]
+        self.fall, previous = np.zeros(len(network.nodes)), np.full(len(network.nodes), -1.0)
+        while (self.fall != previous).any():
+            previous = self.fall.copy()
+            np.maximum.at(self.fall, recipients, np.where(hands_on, previous, self.ranges.exits[1])[donors])
 
-    def write(self, slowest: float) -> None:
-        """Write all rows, with κ = ``slowest``."""
+    def write(self) -> None:
+        """Write all rows."""
         ranges, layout, network = self.ranges, self.layout, self.network
         piece, (low, high) = np.arange(layout.pieces)[:, None], ranges.rate
         nodes = np.flatnonzero(self.follows)
         arcs = np.setdiff1d(np.flatnonzero((low < high) & ~ranges.by_schedule), ranges.followers)
         arcs = arcs[self.follows[ranges.driver[arcs]]]
         for i in range(layout.degree + 1):
-            moment, growth = piece * (layout.degree + 1) + i, _growth(slowest, layout, i)
+            moment, growth = piece * (layout.degree + 1) + i, _growth(self.fall, layout, i)
             row = self.rows.add(2, 1, piece, nodes, i)
             self.rows.put(row, layout.stock[moment] + nodes, 1.0)
-            self.rows.put(row, layout.end[piece] + nodes, -growth)
-            self._allow(row, nodes, self.transients[i, nodes], growth * self.responses[nodes])
+            self.rows.put(row, layout.end[piece] + nodes, -growth[nodes])
+            self._allow(row, nodes, self.transients[i, nodes], growth[nodes, None] * self.responses[nodes])
+            self._allow_varying(row, (layout.degree + 1) * self.responses[nodes])
             for side in (0, 1):
                 key = 1, len(network.nodes) + 2 * arcs + side
-                row = _put_factor(ranges, self.rows, key, arcs, side, i, growth)
                 driver = ranges.driver[arcs]
+                row = _put_factor(ranges, self.rows, key, arcs, side, i, growth[driver])
                 spread = (high[arcs] - low[arcs])[:, None]
-                self._allow(row, driver, spread * self.transients[i, driver], spread * growth * self.responses[driver])
+                responses = growth[driver, None] * self.responses[driver]
+                self._allow(row, driver, spread * self.transients[i, driver], spread * responses)
+                self._allow_varying(row, spread * (layout.degree + 1) * self.responses[driver])
         fast = nodes[nodes < self.stores]
         row = np.full((layout.pieces, len(network.nodes)), -1)
         row[:, fast] = self.rows.add(2, 1, piece, fast, layout.degree + 1)
         self.rows.put(row[:, fast], layout.end[piece] + fast, 1.0)
         inflows = np.flatnonzero(np.isin(network.recipients, fast))
         into = network.recipients[inflows]
-        margin = (ranges.exits[0, np.minimum(into, self.stores - 1)] - slowest) * layout.length
+        margin = (ranges.exits[0, np.minimum(into, self.stores - 1)] - self.fall[into]) * layout.length
         factor = layout.length * special.exprel(-margin) * WIDER  # (1 − e^{−(k − κ)δ})/(k − κ)
         self.rows.put(row[:, into], layout.end_flow[piece] + inflows, -factor)
         lengths = np.zeros(self.stores)
         lengths[into] = factor
         shortfall = lengths[fast, None] * self.arrivals[fast]
         self._allow(row[:, fast], fast, self.after[np.searchsorted(self.fast, fast)], shortfall)
+        self._allow_varying(row[:, fast], layout.length * self.arrivals[fast])
+
+    def _allow_varying(self, row: Integers, weight: Floats) -> None:
+        """Allow rows so many times what lifetimes give, in the mean of a piece, beside what is constant.
+
+        Args:
+            row: shape (pieces, rows).
+            weight: by the node that it enters, shape (rows, nodes).
+        """
+        layout, count = self.layout, self.layout.degree + 1
+        of_exits = weight[:, self.network.recipients[self.exits]]
+        place, exit_ = np.nonzero(of_exits)
+        arcs, of_exits = self.exits[exit_], of_exits[place, exit_]
+        columns = layout.flow.reshape(layout.pieces, 1, count) + arcs[:, None]
+        self.rows.put(row[:, place, None], columns, -of_exits[:, None] / count)
+        self.rows.put(row[:, place], layout.steady_column(arcs), of_exits)
 
     def _allow(self, row: Integers, nodes: Integers, transients: Floats, responses: Floats) -> None:
         """Allow for the transients of nodes, and for what they respond to schedules that may be cut."""

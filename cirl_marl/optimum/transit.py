@@ -12,7 +12,7 @@ flows: by schedule from a stock that is refilled, out of lifetimes with fast sta
 
 Of such flows, and of all that leaves lifetimes, A may have a part a_k too, at most what flows at any time of the
 interval (``partly_steady``). An order from a refilled stock is all of it, unless it may be cut; of what entered a
-lifetime, and of what was there, the least that leaves in any moment, or of one that is stretched at any time.
+lifetime, and of what was there, the least that leaves at any time.
 """
 
 from __future__ import annotations

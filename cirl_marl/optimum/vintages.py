@@ -254,10 +254,12 @@ class Lifetimes:
             beside, kernels = [outflow, -outflow], [-high, low]
             limits += [from_start, -from_start]
             if has_steady:
-                least = low.toarray().reshape(len(intervals), -1, low.shape[1]).min(axis=1)
+                least, of_start = self._kernel(lifetime, layout, intervals).least
+                masses = lifetime.masses(initial)
+                start = np.array([(rows @ masses).min() for rows in of_start])
                 beside.append(-steady)
-                kernels.append(sparse.csr_array(least))
-                limits.append(-from_start.reshape(len(intervals), -1).min(axis=1))
+                kernels.append(sparse.csr_array(least.reshape(len(intervals), layout.pieces, -1).min(axis=1)))
+                limits.append(-start.reshape(len(intervals), -1).min(axis=1))
             if self._bounds_stock(lifetime, layout):
                 stock = _column_sums(ends + self.plan_network.node_index[lifetime.node.id], width)
                 kernel = self._kernel(lifetime, layout, intervals)
