@@ -36,12 +36,12 @@ def degrees(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 SHORT = load_network("copper_net").with_options(episode={"horizon": 12})
-"""Its best plan is 4 % from the bound of degree 1, 0.5 % from that of degree 2."""
+"""Its best plan is 0.9 % from the bound of degree 1, 0.5 % from that of degree 2."""
 EMPTYING = 1.0
 """Action of everybody that leaves 75 % of the service."""
 
 
-@pytest.mark.parametrize(("within", "tried"), [(0.05, [1]), (0.01, [1, 2])])
+@pytest.mark.parametrize(("within", "tried"), [(0.01, [1]), (0.006, [1, 2])])
 def test_as_many_programs_as_the_gap_asks_for(degrees: list[int], within: float, tried: list[int]) -> None:
     """The plan is an episode that keeps the service, and the bound is the one of the last degree, with a proof."""
     found = close_gap(SHORT, within=within, min_service=0.95)
@@ -56,9 +56,9 @@ def test_as_many_programs_as_the_gap_asks_for(degrees: list[int], within: float,
 
 def test_a_plan_is_proved_as_far_as_is_asked(degrees: list[int]) -> None:
     """``plan`` with a gap goes on to a tighter bound, and says how far the episode that it shows is from it."""
-    found = plan(SHORT, "optimum", min_service=0.95, smooth=False, gap=0.01)
+    found = plan(SHORT, "optimum", min_service=0.95, smooth=False, gap=0.006)
     assert degrees == [1, 2]
-    assert float(found.proof.split("gap ")[1].rstrip("%")) <= 1.0
+    assert float(found.proof.split("gap ")[1].rstrip("%")) <= 0.6
     assert found.rollout.episode_levels.min() >= 0.95 - improve.TOLERATED_SHORTFALL
 
 
@@ -67,7 +67,7 @@ def test_no_time_is_time_for_the_first_bound(degrees: list[int]) -> None:
     found = close_gap(SHORT, within=1e-4, seconds=0.0, min_service=0.95)
     assert degrees == [1]
     np.testing.assert_array_equal(found.bound.actions, bound(SHORT, min_service=0.95, degree=1, tight=True).actions)
-    assert found.gap > 0.01
+    assert found.gap > 0.006
 
 
 @pytest.mark.parametrize(

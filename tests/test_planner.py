@@ -274,7 +274,7 @@ def test_the_best_of_a_round_counts_and_what_it_lacks_is_asked_for(monkeypatch: 
     monkeypatch.setattr(improve, "step_program", program)
     monkeypatch.setattr(improve, "best_values", lambda problem, scale: next(steps))
     monkeypatch.setattr(improve.Trials, "value", lambda trials, run, price: run.worth)
-    better = improve_plan(found, rounds=2)
+    better = improve_plan(found, rounds=2, starts=1)
     np.testing.assert_allclose(better.actions, np.clip(np.clip(found.actions + 0.002, -1, 1) + 0.016, -1, 1))
     assert demands == [pytest.approx(0.995), 1.0]
     first, second = programs
