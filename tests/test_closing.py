@@ -142,17 +142,17 @@ def test_plans_are_made_again_while_one_is_short(degrees: list[int], monkeypatch
 
 
 def test_a_plan_that_gets_hardly_nearer_waits_for_a_tighter_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A step has to make a quarter of what is still too much of the gap, unless no further bound will be proved."""
+    """Three steps have to make a quarter of what is still too much, unless no further bound will be proved."""
     answers = list[list[bool]]()
 
     def steps(found: Bound, *, enough: Callable[[Any], bool], **options: Any) -> Bound:
-        answers.append([enough(value) for value in (0.9, 0.5, 0.4, 0.39, 0.1)])
+        answers.append([enough(value) for value in (0.9, 0.5, 0.4, 0.39, 0.39, 0.38, 0.1)])
         return found
 
     monkeypatch.setattr(closing, "improve_plan", steps)
     monkeypatch.setattr(closing, "_gap", lambda solution, run: run if isinstance(run, float) else 0.9)
     close_gap(SHORT, within=0.1, degrees=(1, 2), min_service=0.95)
-    assert answers == [[False, False, False, True, True], [False, False, False, False, True]]
+    assert answers == [[False] * 5 + [True, True], [False] * 6 + [True]]
 
 
 def test_steps_that_promise_little_are_not_made(monkeypatch: pytest.MonkeyPatch) -> None:

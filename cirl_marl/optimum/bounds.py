@@ -259,7 +259,8 @@ def bound(
         horizon: decisions per episode; None takes the definition's.
         degree: degree of the test polynomials, 1 or more; higher is tighter and slower.
         tight: whether flows that may vary within an interval, such as what leaves lifetimes, have constant parts, so
-            that shares of them cannot change: mostly tighter where there are lifetimes, and somewhat slower.
+            that shares of them cannot change, and stocks hold of what enters them what they must: tighter, mostly where
+            there are lifetimes or fast stocks, and somewhat slower.
         near: a bound of a similar program, from whose solution this one is reached sooner: another start or level. Of
             the same network with another degree what it can reach is taken over.
         uncertain: whether disturbances and uncertain numbers are drawn, and how if not by default; excludes

@@ -93,7 +93,7 @@ class Programs:
         admissible: ranges of the flows.
         layout: of the variables of an interval.
         system: which bounds the stocks.
-        steady_parts: whether what is constant of flows that may vary has variables.
+        steady_parts: whether what is constant of flows that may vary has variables, and stocks rows of responses.
     """
 
     def __init__(
@@ -126,7 +126,8 @@ class Programs:
             loose: how far bounds of what leaves lifetimes may be apart (``Lifetimes.pieces``).
             constant_shares: whether shares of what passes nodes without stock are constant within an interval, unless
                 the degree is 0, the program large or its layout given.
-            steady_parts: whether what is constant of flows that may vary has variables for these: tighter, and slower.
+            steady_parts: whether what is constant of flows that may vary has variables for these, and stocks have rows
+                of what they hold of what enters: tighter, and slower.
             system: of a program of the same network and agents, whatever their services demand.
             intervals: that programs will be of; None: of all.
             layout: of another program of the network, whatever its numbers; None: what its own ask for.
@@ -162,7 +163,7 @@ class Programs:
             if cache is None:
                 equal_links, equal, under_links, under = rows()
             else:
-                key = ("rows", layout.key, admissible.key(kind))
+                key = ("rows", layout.key, steady_parts, admissible.key(kind))
                 equal_links, equal, under_links, (now, before, looser) = cache.value(key, rows)
                 under = layout.with_levels(now, admissible.service_low[kind]), before, looser
             self._equal.add(kind, equal_links, equal)
@@ -184,7 +185,8 @@ class Programs:
         service_levels(ranges, under)
         if layout.degree:
             decay_rows(ranges, under_links)
-            response_rows(ranges, under_links)
+            if self.steady_parts:
+                response_rows(ranges, under_links)
         else:
             mean_stocks(ranges, equal_links)
             held_arcs = np.flatnonzero(ranges.proportional & (ranges.rate[0] < ranges.rate[1]))

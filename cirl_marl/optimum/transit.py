@@ -224,6 +224,7 @@ class ConstantShares:
         self.network, self.layout = ranges.network, rows.layout
         self.stores, self.interval = len(ranges.network.stores), ranges.network.episode.control_interval
         self.node_column, self.arc_column = _columns(rows.layout)
+        self._responses_past: dict[bytes, Floats] = {}
 
     def write(self) -> None:
         """Write them."""
@@ -308,10 +309,11 @@ class ConstantShares:
         visits: Floats = self.linear.routes.visits[entries - self.stores, donor - self.stores] * WIDER
         return visits
 
-    def _most_outflow(self, donor: int, sources: Sources) -> float:
-        """Return what fast stocks make pass a node at the most, of a unit of flow into them in an interval."""
-        flow = self.linear.pass_flow[[donor - self.stores]][:, sources.fast]
-        return float(flow.toarray().max(initial=0.0)) * self.interval * WIDER
+    def _responses(self, fast: Integers) -> Floats:
+        """Return the most that passes nodes of a unit of flow into each, past fast stocks."""
+        if (key := fast.tobytes()) not in self._responses_past:
+            self._responses_past[key] = cut_responses(self.ranges, self.linear, fast)[0]
+        return self._responses_past[key]
 
     def _allow_dry(self, rows: Integers, donor: int, arcs: Integers, sources: Sources, factor: Floats | float) -> None:
         """Allow for what changes in schedules whose donors may run dry, ``factor`` times."""
@@ -321,13 +323,17 @@ class ConstantShares:
         spread, recipients = (factor * np.diff(self.ranges.rate[:, arcs], axis=0))[..., None], self.network.recipients
         self.rows.loosen(rows[..., None], direct, spread * self._visits(donor, recipients[direct]))
         if len(behind):
-            responses = cut_responses(self.ranges, self.linear, sources.fast)[0]
-            self.rows.loosen(rows[..., None], behind, spread * responses[donor, recipients[behind]])
+            responses = self._responses(sources.fast)[donor, recipients[behind]]
+            self.rows.loosen(rows[..., None], behind, spread * responses)
 
     def _allow_varying(
         self, rows: Integers, donor: int, spread: Floats, sources: Sources, moments: Integers, ratio: Floats
     ) -> None:
-        """Allow for what may fall otherwise of flows: it passes at once, and past fast stocks later."""
+        """Allow for what may fall otherwise of flows: it passes at once, and past fast stocks later.
+
+        As B_0 + … + B_i falls, the mean under B_i of what passes later is at most the sum of what enters until then in
+        all moments, times what passes in all.
+        """
         layout, transit, (direct, behind) = self.layout, self.transit, sources.varying
         at = moments[:, None, None, None]
         # what flows by schedule is constant in a substep
@@ -336,10 +342,13 @@ class ConstantShares:
         weight = kept * transit.varying_part[direct] * self._visits(donor, transit.varying_entry[direct])
         self.rows.put(rows[..., None], layout.flow[at] + transit.varying_flow[direct], -spread * weight)
         self._put_steady(rows, direct, spread * weight)
-        share = transit.varying_part[behind] * self._most_outflow(donor, sources) / len(layout.moments)
-        columns = layout.flow[:, None] + transit.varying_flow[behind]
-        self.rows.put(rows[..., None, None], columns, -spread[..., None] * share)
-        self._put_steady(rows, behind, spread * share * len(layout.moments))
+        if not len(behind):
+            return
+        share = transit.varying_part[behind] * self._responses(sources.fast)[donor, transit.varying_entry[behind]]
+        for moment in moments.tolist():
+            columns = layout.flow[: moment + 1, None] + transit.varying_flow[behind]
+            self.rows.put(rows[moment][..., None, None], columns, -spread[..., None] * share)
+            self._put_steady(rows[moment], behind, spread * share * (moment + 1))
 
     def _put_steady(self, rows: Integers, places: Integers, weight: Floats) -> None:
         """Put weights of the constant parts of flows that may fall otherwise, shape (..., places), into rows."""
