@@ -281,6 +281,84 @@ def test_rows_and_boxes_hold_in_an_episode(lifetime: Lifetime, stretch: float | 
     assert room < 1e-2 * left.max()
 
 
+@pytest.mark.sample(6)
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize(("mean", "deviation"), [(1.5, 0.4), (3.0, 0.6), (6.0, 3.0), (0.6, None)])
+@pytest.mark.parametrize("rate", [4.0, 30.0])
+def test_rows_hold_behind_a_stock_that_nothing_enters_any_more(
+    degree: int, mean: float, deviation: float | None, rate: float
+) -> None:
+    """A furnace that melts what is discarded, less and less of it: whatever is what a short simulation says.
+
+    Without what is allowed for beside the constant part of the lifetime, rows of theorems 3 and 6 would be wrong.
+    """
+    share = Control(kind=ControlKind.SHARE, low=0.1, neutral=0.6, high=0.9)
+    years, use = 3, Node(id="use", initial=(90.0, 90.0))
+    network = Network(
+        name="scrapyard",
+        nodes=(
+            replace(use, rate=1.0 / mean)
+            if deviation is None
+            else replace(use, lifetime=Lifetime(mean=mean, deviation=deviation)),
+            Node(id="furnace", initial=(1.0, 1.0)),
+            Node(id="scrap", initial=(0.0, 0.0)),
+            Node(id="tip", role=Role.LANDFILL, initial=(0.0, 0.0)),
+            Node(id="yard", stores=False),
+            Node(id="market", stores=False),
+        ),
+        arcs=(
+            Arc(id="old", donor="use", recipient="yard", law=Law.SHARE),
+            Arc(id="collected", donor="yard", recipient="furnace", law=Law.SHARE, control=share),
+            Arc(id="lost", donor="yard", recipient="tip", law=Law.SHARE),
+            Arc(id="melted", donor="furnace", recipient="market", rate=rate),
+            Arc(id="sold", donor="market", recipient="scrap", law=Law.SHARE, control=share),
+            Arc(id="spilt", donor="market", recipient="tip", law=Law.SHARE),
+        ),
+        time_unit="year",
+        episode=Episode(control_interval=1.0, horizon=years),
+    )
+    programs = Programs(Admissible.of(network), degree, None, merge_pieces=True, steady_parts=True)
+    layout, lifetimes = programs.layout, programs.admissible.lifetimes
+    assert layout.pieces == 1 and layout.has_end_flows
+    problem = programs.program(by_stage(network, lifetimes.state_layout, network.initial[1]))
+    short = network.with_options(episode={"control_interval": 1.0 / FINE, "horizon": years * FINE})
+    run = rollout(MultiAgentVectorEnv(short, num_envs=1), Neutral())
+    plan = lifetimes.plan_network
+    flows = run.flow[:, [network.arc_index.get(arc.id, 0) for arc in plan.arcs]]
+    of_life = np.array([arc.id not in network.arc_index for arc in plan.arcs])
+    flows[:, of_life] = run.flow[:, [network.arc_index["old"]]]
+    places = [network.node_index[node.id] for node in plan.stores]
+    ends = np.concatenate([network.initial[[1]], run.stock])[:, places]
+    stocks, stores = (ends[1:] + ends[:-1]) / 2, len(plan.stores)
+    passing = np.stack(
+        [flows[:, plan.recipients == node].sum(axis=1) for node in range(stores, len(plan.nodes))], axis=1
+    )
+    values = np.zeros((years, layout.size))
+    for year in range(years):
+        of_year = slice(year * FINE, (year + 1) * FINE)
+        held, moved = np.concatenate([stocks, passing], axis=1)[of_year], flows[of_year]
+        for moment in range(degree + 1):
+            values[year, layout.stock[moment] :][: held.shape[1]] = weighted(held.T, degree)[:, moment]
+            values[year, layout.flow[moment] :][: moved.shape[1]] = weighted(moved.T, degree)[:, moment]
+        last = 1.5 * moved[-1] - 0.5 * moved[-2]
+        values[year, layout.end[0] :][:stores] = ends[(year + 1) * FINE]
+        values[year, layout.end[0] + stores :][: passing.shape[1]] = (
+            1.5 * passing[of_year][-1] - 0.5 * passing[of_year][-2]
+        )
+        values[year, layout.end_flow[0] :][: len(last)] = last
+        least = moved[:, of_life].min(initial=0.0 if deviation is None else np.inf)
+        for arc in layout.steady_arcs.tolist():
+            part = {"collected": 0.6, "lost": 0.4, "sold": 0.0, "spilt": 0.0}.get(plan.arcs[arc].id, 1.0)
+            values[year, layout.steady_column(arc)] = part * least
+        for k, node in enumerate(layout.steady_nodes.tolist()):
+            values[year, layout.steady + k] = 0.0 if plan.nodes[node].id == "market" else least
+    size = abs(problem.under) @ np.abs(values.ravel()) + np.abs(problem.under_to)
+    excess = problem.under @ values.ravel() - problem.under_to
+    assert (excess <= 3e-3 * size + 1e-6).all(), (excess / (size + 1e-9)).max()
+    error = np.abs(problem.equal @ values.ravel() - problem.equal_to)
+    assert (error <= 3e-3 * (abs(problem.equal) @ np.abs(values.ravel()) + np.abs(problem.equal_to)) + 1e-6).all()
+
+
 @pytest.mark.sample(2)
 @pytest.mark.parametrize("style", ["ends", "inside", "switch"])
 @pytest.mark.parametrize("lifetime", [LIVES[0], LIVES[2], Lifetime(mean=12.0, deviation=3.0, distribution="lognormal")])

@@ -51,7 +51,7 @@ class Series(CheckedRecord, TimeDependent):
     @property
     def extremes(self) -> tuple[float, float]:
         """Bounds of its values, which it reaches if it has no factor."""
-        low, high = (end(self.values, default=math.nan) for end in (min, max))
+        low, high = min(self.values), max(self.values)
         if self.factor is None:
             return low, high
         corners = [end * bound for end in (low, high) for bound in self.factor.extremes]
