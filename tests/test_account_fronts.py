@@ -230,7 +230,7 @@ def test_money_against_emissions_in_numbers_and_in_a_picture(tmp_path: Path, mon
     network = corner()
     front = account_front(network, ("cost", "emissions"), min_service=0.97, points=3)
     assert front.signs.tolist() == [-1.0, -1.0] and front.units == ("EUR_2023", "t CO2e")
-    middle = bound(network, aim="cost", at_most={"emissions": front.demands[1, 0]}, min_service=0.97)
+    middle = bound(network, aim="cost", at_most={"emissions": front.demands[1, 0]}, min_service=0.97, tight=True)
     assert front.bounds[1] == pytest.approx(-middle.objective, rel=1e-6)
     assert (np.diff(front.bounds) < 0).all() and (front.plans[:, 0] >= front.bounds - 1e-6).all()
     usual = rollout(MultiAgentVectorEnv(network, num_envs=1), Neutral())
