@@ -89,7 +89,8 @@ def improve_plan(
         bound: with the actions to start from.
         rounds: most linear programs to solve, from each start.
         starts: how many actions to begin from: those of the bound, then random ones, constant in time and always the
-            same; None: 1, with services of contents CONTENT_STARTS, in small networks SMALL_STARTS.
+            same; None: 1, with services of contents CONTENT_STARTS, in small networks SMALL_STARTS, as many as
+            it takes of these where another small plan is short.
         least_gain: part of the objective that a step has to promise, or no more are made where nothing is short.
         enough: asked of each episode that is better than those before, whether to stop there.
         progress: called with the share of them that is solved; 1 when no more are needed.
